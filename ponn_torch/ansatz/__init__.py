@@ -1,0 +1,1 @@
+"""How an unknown function is written: free functions, constraints and constrained expressions."""

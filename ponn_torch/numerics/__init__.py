@@ -1,0 +1,1 @@
+"""Tensors only: nodes, quadrature, interpolation and linear algebra."""

@@ -1,0 +1,1 @@
+"""Optimisers that know only a residual and its linearisation."""

@@ -1,0 +1,1 @@
+"""From an optimal control problem to a residual, through Pontryagin's minimum principle."""

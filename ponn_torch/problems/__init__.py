@@ -1,0 +1,1 @@
+"""Optimal control problems, one file each."""

@@ -1,0 +1,1 @@
+"""Continuation, switches, refinement, certificate: from a residual to a certified solution."""
