@@ -1,6 +1,5 @@
 # Everything below needs only python3 (3.11 or later), pip and make.
 PYTHON ?= python3
-EXTRAS ?= dev,baselines
 WORKERS ?= 2
 DEMO_DIR ?= runs/demo
 
@@ -20,7 +19,7 @@ $(READY): pyproject.toml constraints.txt
 	@$(PYTHON) -c 'import sys; sys.exit(0 if sys.version_info >= (3, 11) else "Python 3.11 or later is needed: make PYTHON=/path/to/python3.11")'
 	@echo "Installing ponn-torch and its dependencies into $(VENV) (a few minutes the first time) ..."
 	@$(PYTHON) -m venv $(VENV)
-	@$(BIN)/python -m pip install -qq --disable-pip-version-check -c constraints.txt -e ".[$(EXTRAS)]"
+	@$(BIN)/python -m pip install -qq --disable-pip-version-check -c constraints.txt -e ".[dev,baselines,parallel,notebooks]"
 	@touch $@
 
 demo: $(READY)  ## solve the default problem (Earth-Mars transfer), fly it and certify it
