@@ -1,0 +1,179 @@
+"""The constrained expression y(z) = g(z) + Ω(z) (κ - C[g]) meets C[y] = κ whatever the free function g is.
+
+Theory of functional connections (Mortari 2017); with a network as g, X-TFC (Schiassi et al. 2021).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import torch
+from torch import Tensor, nn
+
+from ponn_torch.ansatz.basis import Chebyshev, LinearBasis
+from ponn_torch.ansatz.constraints import Constraint, SwitchingFunctions, apply, functional_matrix
+from ponn_torch.numerics.nodes import NodeSet
+
+
+def _identity(table: Tensor) -> Tensor:
+    return torch.eye(table.shape[1], dtype=table.dtype, device=table.device)
+
+
+def _columns(table: Tensor) -> Tensor:
+    """Unit columns: (L, L), diagonal. A column of zeros is left as it is."""
+    norms = table.norm(dim=0)
+    return torch.diag(1 / torch.where(norms > 0, norms, 1.0))
+
+
+def _orthonormal(table: Tensor, truncation: float = 1e-9) -> Tensor:
+    """Orthonormal columns: (L, L'), in Gram-Schmidt order if all are independent, else by a truncated SVD."""
+    scale = _columns(table)
+    triangle = torch.linalg.qr(table @ scale, mode="r").R
+    _, singular, right = torch.linalg.svd(triangle, full_matrices=False)
+    keep = singular > truncation * singular[0]
+    if int(keep.sum()) < table.shape[1]:
+        return scale @ (right[keep].T / singular[keep])
+    signs = torch.diag(triangle.diagonal().sign())
+    return scale @ torch.linalg.solve_triangular(triangle, signs, upper=True)
+
+
+# Each maps a table (n, L) of functions to the combinations W (L, L') that condition it as table @ W.
+CONDITIONINGS: dict[str, Callable[[Tensor], Tensor]] = {
+    "none": _identity,
+    "columns": _columns,
+    "orthonormal": _orthonormal,
+}
+
+
+class ConstrainedExpression(nn.Module):
+    """y = B β + Ω κ with tables B and Ω that depend on neither the weights β nor the targets κ.
+
+    Shapes: over one variable, β (..., L', d) and κ (..., n_constraints, d) for d components that share the
+    tables; over n_variables > 1, β (..., L', n_variables) and κ (..., n_constraints).
+
+    conditioning replaces the free functions by fixed combinations of them, computed once on `nodes`:
+    "columns" divides each by the quadrature RMS of its derivative of the given order (the highest one in the
+    residual); "orthonormal" makes these derivatives orthonormal and drops dependent functions (singular values
+    below 1e-9 of the largest), so L' <= L. Where the constraints leave functions whose derivative of that
+    order is zero, the norm contains the value too. Over several variables it is the norm of the functions
+    before the constraints.
+
+    A polynomial basis should leave out what the supports span: Chebyshev(L, lowest_degree=n_constraints).
+
+    Raises ValueError for an unknown conditioning, one without nodes, and constraints that clash.
+    """
+
+    combinations: Tensor  # W (L, L')
+    functionals: Tensor  # C of the combined functions, (n_constraints, n_variables, L')
+
+    def __init__(
+        self,
+        basis: LinearBasis,
+        constraints: Sequence[Constraint],
+        n_variables: int = 1,
+        *,
+        nodes: NodeSet | None = None,
+        order: int = 0,
+        conditioning: str = "none",
+        dtype: torch.dtype = torch.float64,
+        device: torch.device | str = "cpu",
+    ) -> None:
+        super().__init__()
+        if conditioning not in CONDITIONINGS:
+            raise ValueError(f"conditioning = {conditioning!r}; allowed: {', '.join(CONDITIONINGS)}")
+        if nodes is None and conditioning != "none":
+            raise ValueError(f"nodes = None with conditioning = {conditioning!r}; allowed: a NodeSet")
+        self.basis = basis
+        self.constraints = tuple(constraints)
+        self.n_variables = n_variables
+        self.switching = SwitchingFunctions(self.constraints, n_variables, dtype=dtype, device=device)
+        functionals = functional_matrix(
+            self.constraints, basis.features, basis.size, n_variables, dtype=dtype, device=device
+        )
+        self.register_buffer("combinations", torch.eye(basis.size, dtype=dtype, device=device))
+        self.register_buffer("functionals", functionals)
+        if nodes is not None:
+            self.combinations = CONDITIONINGS[conditioning](self._table_to_condition(nodes, order))
+            self.functionals = functionals @ self.combinations
+
+    @property
+    def size(self) -> int:
+        """L', the number of free coefficients per component."""
+        return self.combinations.shape[1]
+
+    @property
+    def n_constraints(self) -> int:
+        return len(self.constraints)
+
+    def _table_to_condition(self, nodes: NodeSet, order: int) -> Tensor:
+        """Column norms are RMS values of derivative `order`, with the value if that derivative can vanish."""
+        constraints = self.constraints if self.n_variables == 1 else ()
+        table = self.basis.features(nodes.points, order)
+        if constraints:
+            table = self.tables(nodes.points, order)[0]
+        low = functional_matrix(constraints, Chebyshev(order).features, order, 1)[:, 0] if order else None
+        vanishing = low is not None and int(torch.linalg.matrix_rank(low)) < order
+        root = (nodes.weights / 2).sqrt()[:, None]
+        return torch.cat([root * table[e] for e in ((0, order) if vanishing else (order,))])
+
+    def tables(self, z: Tensor, order: int) -> tuple[Tensor, Tensor]:
+        """B and Ω with derivatives 0..order at z (n,).
+
+        Over one variable B (order+1, n, L') and Ω (order+1, n, n_constraints); over several, y_v may respond
+        to the weights of every u: B (order+1, n, v, L', u) and Ω (order+1, n, v, n_constraints).
+        """
+        free = self.basis.features(z, order) @ self.combinations
+        switching = self.switching(z, order)
+        if self.n_variables == 1:
+            switching = switching[:, :, 0]
+            return free - switching @ self.functionals[:, 0], switching
+        own = torch.eye(self.n_variables, dtype=free.dtype, device=free.device)
+        removed = torch.einsum("onvk,kul->onvlu", switching, self.functionals)
+        return torch.einsum("onl,vu->onvlu", free, own) - removed, switching
+
+    def jet(self, weights: Tensor, kappa: Tensor, z: Tensor, order: int) -> Tensor:
+        """y and its derivatives 0..order at z (n,): (..., order+1, n, d), with d = n_variables if above 1."""
+        free, switching = self.tables(z, order)
+        if self.n_variables == 1:
+            known = torch.einsum("onk,...kd->...ond", switching, kappa)
+            return torch.einsum("onl,...ld->...ond", free, weights) + known
+        known = torch.einsum("onvk,...k->...onv", switching, kappa)
+        return torch.einsum("onvlu,...lu->...onv", free, weights) + known
+
+    def check(self, weights: Tensor, kappa: Tensor) -> Tensor:
+        """C[y] - κ of every constraint, in the shape of κ: round-off, if the expression keeps its word."""
+
+        def function(z: Tensor, order: int) -> Tensor:
+            jet = self.jet(weights, kappa, z, order)
+            return jet.movedim(-1, 0).unsqueeze(-1) if self.n_variables == 1 else jet
+
+        if not self.constraints:
+            return torch.zeros_like(kappa)
+        values = [apply(c, function, dtype=weights.dtype, device=weights.device) for c in self.constraints]
+        achieved = torch.stack(values, dim=-1)
+        return (achieved.movedim(0, -1) if self.n_variables == 1 else achieved) - kappa
+
+    def fit(
+        self, z: Tensor, y: Tensor, kappa: Tensor, *, weights: Tensor | None = None, ridge: float = 0.0
+    ) -> Tensor:
+        """β of the least-squares projection of values y (..., n, d) at z (n,), for given targets κ.
+
+        Minimises Σ_i weights_i |y(z_i) - y_i|² + ridge |β|², weights (n,) by default 1, by the singular value
+        decomposition of the table: singular values below round-off are dropped, which gives the shortest β.
+        """
+        root = torch.ones_like(z) if weights is None else weights.sqrt()
+        rest = root[:, None] * (y - self.jet(y.new_zeros(self.size, y.shape[-1]), kappa, z, 0)[..., 0, :, :])
+        table = self.tables(z, 0)[0][0]
+        if self.n_variables == 1:
+            return _least_squares(root[:, None] * table, rest, ridge)
+        matrix = (root[:, None, None, None] * table).flatten(2).flatten(0, 1)  # rows (n, v), columns (L', u)
+        solution = _least_squares(matrix, rest.flatten(-2).unsqueeze(-1), ridge)
+        return solution.squeeze(-1).unflatten(-1, (self.size, self.n_variables))
+
+
+def _least_squares(matrix: Tensor, target: Tensor, ridge: float) -> Tensor:
+    # the SVD and not torch's lstsq, whose drivers for deficient rank exist on the CPU only
+    left, singular, right = torch.linalg.svd(matrix, full_matrices=False)
+    round_off = torch.finfo(matrix.dtype).eps * max(matrix.shape) * singular[0]
+    inverse = torch.where(singular > round_off, singular / (singular**2 + ridge), 0.0)
+    return right.T @ (inverse[:, None] * (left.T @ target))
