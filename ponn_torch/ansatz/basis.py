@@ -28,6 +28,10 @@ class LinearBasis(nn.Module, ABC):
     def features(self, z: Tensor, order: int) -> Tensor:
         """Derivatives 0..order of every function at z (n,): (order+1, n, L)."""
 
+    def beyond(self, n_supports: int) -> LinearBasis:
+        """The same number of functions, without those that n_supports polynomial supports span already."""
+        return self
+
     def jet(self, weights: Tensor, z: Tensor, order: int) -> Tensor:
         """g and its derivatives for weights (..., L, d) at z (n,): (..., order+1, n, d)."""
         return torch.einsum("onl,...ld->...ond", self.features(z, order), weights)
@@ -41,6 +45,9 @@ class _OrthogonalPolynomials(LinearBasis):
         if lowest_degree < 0:
             raise ValueError(f"lowest_degree = {lowest_degree} is not a degree; allowed: at least 0")
         self.lowest_degree = lowest_degree
+
+    def beyond(self, n_supports: int) -> LinearBasis:
+        return type(self)(self.size, lowest_degree=self.lowest_degree + n_supports)
 
     @staticmethod
     @abstractmethod
@@ -118,6 +125,10 @@ ACTIVATIONS: dict[str, Callable[[Tensor, int], Tensor]] = {  # (u, order) -> (or
     "gaussian": _gaussian,
 }
 
+# Slopes up to these resolve smooth functions on [-1, 1] with 30 to 80 units (measured on second derivatives);
+# flatter units are nearly dependent, steeper ones leave gaps.
+DEFAULT_SLOPES: dict[str, float] = {"tanh": 6.0, "sin": 24.0, "sigmoid": 12.0, "gaussian": 10.0}
+
 
 def _powers(slopes: Tensor, order: int) -> Tensor:
     return torch.stack([slopes**e for e in range(order + 1)])
@@ -142,7 +153,7 @@ class RandomFeatures(LinearBasis):
         activation: str = "tanh",
         *,
         seed: int = 0,
-        weight_range: Sequence[float] = (-8.0, 8.0),
+        weight_range: Sequence[float] | None = None,
         bias_range: Sequence[float] | None = None,
         dtype: torch.dtype = torch.float64,
         device: torch.device | str = "cpu",
@@ -159,7 +170,8 @@ class RandomFeatures(LinearBasis):
                 raise ValueError(f"{field} = {tuple(limits)} is empty; allowed: (low, high) with low < high")
             return low + (high - low) * torch.rand(size, generator=generator, dtype=torch.float64)
 
-        weight = uniform("weight_range", weight_range)
+        slope = DEFAULT_SLOPES[activation]
+        weight = uniform("weight_range", (-slope, slope) if weight_range is None else weight_range)
         if bias_range is None:
             bias = -weight * uniform("centres", (-1.0, 1.0))
         else:

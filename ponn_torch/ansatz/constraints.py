@@ -98,7 +98,7 @@ def integral(
         weight = torch.as_tensor(weight, dtype=quadrature.dtype, device=quadrature.device)
         if weight.shape != quadrature.shape:
             raise ValueError(
-                f"weight has shape {tuple(weight.shape)}; allowed: {tuple(quadrature.shape)}, one entry per node"
+                f"weight has shape {tuple(weight.shape)}; allowed: one per node, {tuple(quadrature.shape)}"
             )
         quadrature, label = quadrature * weight, label.replace("∫", "∫ weight")
     points, coefficients = tuple(nodes.points.tolist()), tuple(quadrature.tolist())

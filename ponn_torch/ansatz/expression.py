@@ -15,30 +15,36 @@ from ponn_torch.ansatz.constraints import Constraint, SwitchingFunctions, apply,
 from ponn_torch.numerics.nodes import NodeSet
 
 
-def _identity(table: Tensor) -> Tensor:
+def _identity(table: Tensor, round_off: Tensor, truncation: float) -> Tensor:
     return torch.eye(table.shape[1], dtype=table.dtype, device=table.device)
 
 
-def _columns(table: Tensor) -> Tensor:
-    """Unit columns: (L, L), diagonal. A column of zeros is left as it is."""
+def _columns(table: Tensor, round_off: Tensor, truncation: float) -> Tensor:
+    """Unit columns, without those that the constraints reduce to round-off."""
     norms = table.norm(dim=0)
-    return torch.diag(1 / torch.where(norms > 0, norms, 1.0))
+    known = round_off < truncation * norms
+    if not known.any():
+        raise ValueError(
+            f"all {len(known)} free functions are spanned by the constraints; allowed: a larger basis"
+        )
+    return torch.diag(1 / norms)[:, known]
 
 
-def _orthonormal(table: Tensor, truncation: float = 1e-9) -> Tensor:
-    """Orthonormal columns: (L, L'), in Gram-Schmidt order if all are independent, else by a truncated SVD."""
-    scale = _columns(table)
+def _orthonormal(table: Tensor, round_off: Tensor, truncation: float) -> Tensor:
+    """Orthonormal columns, in Gram-Schmidt order if they are independent, else by a truncated SVD."""
+    scale = _columns(table, round_off, truncation)
     triangle = torch.linalg.qr(table @ scale, mode="r").R
     _, singular, right = torch.linalg.svd(triangle, full_matrices=False)
     keep = singular > truncation * singular[0]
-    if int(keep.sum()) < table.shape[1]:
+    if int(keep.sum()) < triangle.shape[1]:
+        right = right * right.sum(dim=1, keepdim=True).sign()  # the same on every machine
         return scale @ (right[keep].T / singular[keep])
     signs = torch.diag(triangle.diagonal().sign())
     return scale @ torch.linalg.solve_triangular(triangle, signs, upper=True)
 
 
-# Each maps a table (n, L) of functions to the combinations W (L, L') that condition it as table @ W.
-CONDITIONINGS: dict[str, Callable[[Tensor], Tensor]] = {
+# (table (n, L), round-off in its columns (L,), truncation) -> W (L, L') such that table @ W is conditioned
+CONDITIONINGS: dict[str, Callable[[Tensor, Tensor, float], Tensor]] = {
     "none": _identity,
     "columns": _columns,
     "orthonormal": _orthonormal,
@@ -53,10 +59,10 @@ class ConstrainedExpression(nn.Module):
 
     conditioning replaces the free functions by fixed combinations of them, computed once on `nodes`:
     "columns" divides each by the quadrature RMS of its derivative of the given order (the highest one in the
-    residual); "orthonormal" makes these derivatives orthonormal and drops dependent functions (singular values
-    below 1e-9 of the largest), so L' <= L. Where the constraints leave functions whose derivative of that
-    order is zero, the norm contains the value too. Over several variables it is the norm of the functions
-    before the constraints.
+    residual); "orthonormal" makes these derivatives orthonormal. Both drop functions that the constraints
+    reduce to round-off, the second also dependent ones (singular values below `truncation`, relative), so
+    L' <= L. Where the constraints leave functions whose derivative of that order is zero, the norm contains
+    the value too. Over several variables it is the norm of the functions before the constraints.
 
     A polynomial basis should leave out what the supports span: Chebyshev(L, lowest_degree=n_constraints).
 
@@ -75,6 +81,7 @@ class ConstrainedExpression(nn.Module):
         nodes: NodeSet | None = None,
         order: int = 0,
         conditioning: str = "none",
+        truncation: float = 1e-11,
         dtype: torch.dtype = torch.float64,
         device: torch.device | str = "cpu",
     ) -> None:
@@ -93,7 +100,8 @@ class ConstrainedExpression(nn.Module):
         self.register_buffer("combinations", torch.eye(basis.size, dtype=dtype, device=device))
         self.register_buffer("functionals", functionals)
         if nodes is not None:
-            self.combinations = CONDITIONINGS[conditioning](self._table_to_condition(nodes, order))
+            table, round_off = self._table_to_condition(nodes, order)
+            self.combinations = CONDITIONINGS[conditioning](table, round_off, truncation)
             self.functionals = functionals @ self.combinations
 
     @property
@@ -105,16 +113,22 @@ class ConstrainedExpression(nn.Module):
     def n_constraints(self) -> int:
         return len(self.constraints)
 
-    def _table_to_condition(self, nodes: NodeSet, order: int) -> Tensor:
+    def _table_to_condition(self, nodes: NodeSet, order: int) -> tuple[Tensor, Tensor]:
         """Column norms are RMS values of derivative `order`, with the value if that derivative can vanish."""
         constraints = self.constraints if self.n_variables == 1 else ()
+        low = functional_matrix(constraints, Chebyshev(max(order, 1)).features, max(order, 1), 1)[:, 0]
+        vanishing = order > 0 and int(torch.linalg.matrix_rank(low)) < order
         table = self.basis.features(nodes.points, order)
+        magnitude = table.abs()
         if constraints:
-            table = self.tables(nodes.points, order)[0]
-        low = functional_matrix(constraints, Chebyshev(order).features, order, 1)[:, 0] if order else None
-        vanishing = low is not None and int(torch.linalg.matrix_rank(low)) < order
+            switching, functionals = self.switching(nodes.points, order)[:, :, 0], self.functionals[:, 0]
+            table = table - switching @ functionals
+            magnitude = magnitude + switching.abs() @ functionals.abs()
         root = (nodes.weights / 2).sqrt()[:, None]
-        return torch.cat([root * table[e] for e in ((0, order) if vanishing else (order,))])
+        orders = (0, order) if vanishing else (order,)
+        rows = torch.cat([root * table[e] for e in orders])
+        size = torch.cat([root * magnitude[e] for e in orders]).norm(dim=0)
+        return rows, torch.finfo(size.dtype).eps * size
 
     def tables(self, z: Tensor, order: int) -> tuple[Tensor, Tensor]:
         """B and Ω with derivatives 0..order at z (n,).

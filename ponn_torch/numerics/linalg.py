@@ -1,0 +1,206 @@
+"""Least-squares linear algebra for damped steps: dense Jacobians, and arrow-shaped ones of coupled segments.
+
+A damped step minimises ‖J p + r‖² + ‖√μ D p‖². Two routes are offered: ``cholesky`` factors the normal equations
+after scaling their columns by D (fast, loses digits as cond(J)²), ``qr`` factors the stacked [J; √μ D] (keeps them).
+All arrays may carry leading batch axes; μ then has the batch shape.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+
+import torch
+from torch import Tensor
+
+
+def _cholesky_solve(matrix: Tensor, scale: Tensor, damping: Tensor, right: Tensor) -> Tensor:
+    """Solve (M + μ diag(scale²)) X = right by Cholesky of the scaled matrix; NaN where it is not positive definite."""
+    inverse = 1.0 / scale
+    scaled = matrix * inverse.unsqueeze(-1) * inverse.unsqueeze(-2)
+    scaled.diagonal(dim1=-2, dim2=-1).add_(damping)
+    factor, failed = torch.linalg.cholesky_ex(scaled)
+    solution = torch.cholesky_solve(right * inverse.unsqueeze(-1), factor) * inverse.unsqueeze(-1)
+    return torch.where((failed != 0)[..., None, None], torch.nan, solution)
+
+
+def _qr_tail(matrix: Tensor, scale: Tensor, damping: Tensor, n_lead: int) -> tuple[Tensor, Tensor]:
+    """Triangularise [matrix; √μ diag(scale) 0] and split R after ``n_lead`` columns: (head rows, tail block)."""
+    rows = torch.zeros(*matrix.shape[:-2], n_lead, matrix.shape[-1], dtype=matrix.dtype, device=matrix.device)
+    rows.diagonal(dim1=-2, dim2=-1).copy_(damping.sqrt() * scale)
+    triangle = torch.linalg.qr(torch.cat([matrix, rows], -2), mode="r").R
+    return triangle[..., :n_lead, :], triangle[..., n_lead:, n_lead:]
+
+
+def _back_substitute(head: Tensor, n: int) -> Tensor:
+    """Solve R X = −(columns after n) for head = [R | columns]."""
+    return -torch.linalg.solve_triangular(head[..., :n], head[..., n:], upper=True)
+
+
+@dataclass(frozen=True)
+class DenseJacobian:
+    """A Jacobian as one matrix (..., R, N)."""
+
+    matrix: Tensor
+
+    @cached_property
+    def _normal(self) -> Tensor:
+        return self.matrix.mT @ self.matrix
+
+    def column_norms(self) -> Tensor:
+        """(..., N)."""
+        return torch.linalg.vector_norm(self.matrix, dim=-2)
+
+    def gradient(self, residual: Tensor) -> Tensor:
+        """Jᵀ r, (..., N)."""
+        return (self.matrix.mT @ residual.unsqueeze(-1)).squeeze(-1)
+
+    def apply(self, step: Tensor) -> Tensor:
+        """J p, (..., R)."""
+        return (self.matrix @ step.unsqueeze(-1)).squeeze(-1)
+
+    def dense(self) -> Tensor:
+        return self.matrix
+
+    def solve_damped(self, residual: Tensor, damping: Tensor, scale: Tensor, method: str = "cholesky") -> Tensor:
+        """Step p (..., N); μ (...,), D = diag(scale) with scale (..., N)."""
+        return _METHODS[method][0](self, residual, damping.unsqueeze(-1), scale)
+
+    def _by_cholesky(self, residual: Tensor, damping: Tensor, scale: Tensor) -> Tensor:
+        right = -self.gradient(residual).unsqueeze(-1)
+        return _cholesky_solve(self._normal, scale, damping, right).squeeze(-1)
+
+    def _by_qr(self, residual: Tensor, damping: Tensor, scale: Tensor) -> Tensor:
+        n = self.matrix.shape[-1]
+        head, _ = _qr_tail(torch.cat([self.matrix, residual.unsqueeze(-1)], -1), scale, damping, n)
+        return _back_substitute(head, n).squeeze(-1)
+
+
+@dataclass(frozen=True)
+class ArrowJacobian:
+    """K segments with unknowns of their own, coupled by a few shared ones.
+
+    Rows: the segments' (K × R), then E extra rows that see shared unknowns only. Columns: the segments' own (K × P),
+    then G shared. Segment k's rows see its own columns through ``local`` (..., K, R, P) and the shared columns
+    ``index[k]`` through ``shared`` (..., K, R, S); an index of G means a column that is not an unknown.
+    ``extra`` is (..., E, G). Steps and gradients are ordered [segments' own, shared].
+    """
+
+    local: Tensor
+    shared: Tensor
+    extra: Tensor
+    index: Tensor
+
+    @property
+    def n_shared(self) -> int:
+        return self.extra.shape[-1]
+
+    @property
+    def n_own(self) -> int:
+        return self.local.shape[-3] * self.local.shape[-1]
+
+    @cached_property
+    def _spread(self) -> Tensor:
+        """One-hot (K, S, G): segment columns → shared unknowns; a column that is no unknown has a zero row."""
+        one_hot = torch.nn.functional.one_hot(self.index, self.n_shared + 1)
+        return one_hot[..., : self.n_shared].to(self.local.dtype)
+
+    @cached_property
+    def _normal(self) -> tuple[Tensor, Tensor, Tensor]:
+        return (
+            self.local.mT @ self.local,
+            self.local.mT @ self.shared,
+            self.shared.mT @ self.shared,
+        )
+
+    def _split_rows(self, residual: Tensor) -> tuple[Tensor, Tensor]:
+        k, rows = self.local.shape[-3:-1]
+        return residual[..., : k * rows].unflatten(-1, (k, rows)), residual[..., k * rows :]
+
+    def _gather(self, shared: Tensor) -> Tensor:
+        """Shared unknowns (..., G) as the segments see them (..., K, S)."""
+        return torch.einsum("ksg,...g->...ks", self._spread, shared)
+
+    def _scatter(self, segments: Tensor) -> Tensor:
+        """Sum the segments' columns (..., K, S) into (..., G)."""
+        return torch.einsum("ksg,...ks->...g", self._spread, segments)
+
+    def _scatter_matrix(self, blocks: Tensor) -> Tensor:
+        """Sum (..., K, S, S) into (..., G, G)."""
+        return (self._spread.mT @ blocks @ self._spread).sum(-3)
+
+    def column_norms(self) -> Tensor:
+        own, _, shared = self._normal
+        coupled = self._scatter(shared.diagonal(dim1=-2, dim2=-1)) + (self.extra**2).sum(-2)
+        return torch.cat([own.diagonal(dim1=-2, dim2=-1).flatten(-2), coupled], -1).sqrt()
+
+    def gradient(self, residual: Tensor) -> Tensor:
+        segments, extra = self._split_rows(residual)
+        column = segments.unsqueeze(-1)
+        own = (self.local.mT @ column).flatten(-3)
+        shared = self._scatter((self.shared.mT @ column).squeeze(-1))
+        return torch.cat([own, shared + (self.extra.mT @ extra.unsqueeze(-1)).squeeze(-1)], -1)
+
+    def apply(self, step: Tensor) -> Tensor:
+        own, shared = self._split_columns(step)
+        seen = self._gather(shared)
+        segments = self.local @ own.unsqueeze(-1) + self.shared @ seen.unsqueeze(-1)
+        return torch.cat([segments.flatten(-3), (self.extra @ shared.unsqueeze(-1)).squeeze(-1)], -1)
+
+    def dense(self) -> Tensor:
+        """The whole matrix (..., K·R + E, K·P + G)."""
+        k, rows, own = self.local.shape[-3:]
+        batch = self.local.shape[:-3]
+        out = self.local.new_zeros(*batch, k * rows + self.extra.shape[-2], self.n_own + self.n_shared)
+        for i in range(k):
+            block = slice(i * rows, (i + 1) * rows)
+            out[..., block, i * own : (i + 1) * own] = self.local[..., i, :, :]
+            out[..., block, self.n_own :] = self.shared[..., i, :, :] @ self._spread[i]
+        out[..., k * rows :, self.n_own :] = self.extra
+        return out
+
+    def solve_damped(self, residual: Tensor, damping: Tensor, scale: Tensor, method: str = "cholesky") -> Tensor:
+        """Step p (..., N); the segments' own unknowns are eliminated first, K small factorisations and one of size G."""
+        return _METHODS[method][1](self, residual, damping[..., None, None], scale)
+
+    def _split_columns(self, vector: Tensor) -> tuple[Tensor, Tensor]:
+        k, own = self.local.shape[-3], self.local.shape[-1]
+        return vector[..., : self.n_own].unflatten(-1, (k, own)), vector[..., self.n_own :]
+
+    def _by_cholesky(self, residual: Tensor, damping: Tensor, scale: Tensor) -> Tensor:
+        own, mixed, shared = self._normal
+        scale_own, scale_shared = self._split_columns(scale)
+        gradient_own, gradient_shared = self._split_columns(self.gradient(residual))
+        solved = _cholesky_solve(
+            own, scale_own, damping, torch.cat([mixed, gradient_own.unsqueeze(-1)], -1)
+        )
+        by_shared, by_residual = solved[..., :-1], solved[..., -1]
+        schur = self._scatter_matrix(shared - mixed.mT @ by_shared) + self.extra.mT @ self.extra
+        reduced = gradient_shared - self._scatter((mixed.mT @ by_residual.unsqueeze(-1)).squeeze(-1))
+        step = _cholesky_solve(schur, scale_shared, damping[..., 0], -reduced.unsqueeze(-1)).squeeze(-1)
+        inner = -by_residual - (by_shared @ self._gather(step).unsqueeze(-1)).squeeze(-1)
+        return torch.cat([inner.flatten(-2), step], -1)
+
+    def _by_qr(self, residual: Tensor, damping: Tensor, scale: Tensor) -> Tensor:
+        n, g = self.local.shape[-1], self.n_shared
+        scale_own, scale_shared = self._split_columns(scale)
+        segments, extra = self._split_rows(residual)
+        stacked = torch.cat([self.local, self.shared, segments.unsqueeze(-1)], -1)
+        head, tail = _qr_tail(stacked, scale_own, damping, n)
+        # what each segment leaves over for the shared unknowns, in their numbering
+        left_over = torch.cat([tail[..., :-1] @ self._spread, tail[..., -1:]], -1).flatten(-3, -2)
+        rows = torch.cat([left_over, torch.cat([self.extra, extra.unsqueeze(-1)], -1)], -2)
+        step = _back_substitute(_qr_tail(rows, scale_shared, damping[..., 0], g)[0], g).squeeze(-1)
+        known = head[..., n:-1] @ self._gather(step).unsqueeze(-1) + head[..., -1:]
+        inner = -torch.linalg.solve_triangular(head[..., :n], known, upper=True)
+        return torch.cat([inner.flatten(-3), step], -1)
+
+
+Jacobian = DenseJacobian | ArrowJacobian
+
+_METHODS: dict[str, tuple[Callable[..., Tensor], Callable[..., Tensor]]] = {
+    "cholesky": (DenseJacobian._by_cholesky, ArrowJacobian._by_cholesky),
+    "qr": (DenseJacobian._by_qr, ArrowJacobian._by_qr),
+}
+LINEAR_SOLVERS = tuple(_METHODS)

@@ -1,0 +1,337 @@
+"""Minimisers of the Hamiltonian over a control set, smoothed by a regulariser or pinned to an arc.
+
+A control set sees the Hamiltonian only as a function of its control, ``h(**control) -> (..., 1)``, at a fixed time,
+state and costate. It answers with the minimiser and with its *switching functions*: the scalars whose zeros separate
+the arcs. A bounded scalar control is written lower + (upper − lower) η with η ∈ [0, 1], and S = −(∂H/∂η)/s with s a
+constant in cost per time. Three regimes:
+
+- smoothed, H affine in η: ``s ρ e(η)`` is added to the running cost, so the minimum principle stays exact at every ρ;
+- H convex in η (``curved``): the minimiser is S/curvature clipped to [0, 1] and needs no smoothing;
+- on an arc: the control is at the bound, or in the interior, that the arc's code names.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from typing import Any, NamedTuple, Protocol
+
+import torch
+from torch import Tensor
+from torch.func import grad
+
+Hamiltonian = Callable[..., Tensor]
+
+LOWER, INTERIOR, UPPER = 0, 1, 2  # codes of an arc
+
+
+class Minimiser(NamedTuple):
+    """What a control set answers: the control by name, S (..., m) and the fraction η (..., m) of its range."""
+
+    control: dict[str, Tensor]
+    switching: Tensor
+    fraction: Tensor
+
+
+# -- regularisers: η(S, ρ) minimises −S η + ρ e(η) over [0, 1] -----------------------------------------------------
+
+
+class Regulariser(Protocol):
+    """A convex penalty e(η) on [0, 1] and the law η(S, ρ) that it induces."""
+
+    def fraction(self, switching: Tensor, smoothing: Tensor) -> Tensor: ...
+
+    def penalty(self, fraction: Tensor) -> Tensor: ...
+
+
+@dataclass(frozen=True)
+class Entropy:
+    """e = ½[η ln η + (1−η) ln(1−η)], so η = ½(1 + tanh(S/ρ)): the tanh law (PoNN paper, eq. 44–45)."""
+
+    def fraction(self, switching: Tensor, smoothing: Tensor) -> Tensor:
+        return 0.5 * (1.0 + torch.tanh(switching / smoothing))
+
+    def penalty(self, fraction: Tensor) -> Tensor:
+        return 0.5 * (torch.xlogy(fraction, fraction) + torch.xlogy(1.0 - fraction, 1.0 - fraction))
+
+
+@dataclass(frozen=True)
+class Quadratic:
+    """e = η² − η, so η = ½(1 + S/ρ) clipped: the energy → fuel homotopy at ρ = 1 → 0 (Bertrand and Epenoy)."""
+
+    def fraction(self, switching: Tensor, smoothing: Tensor) -> Tensor:
+        return (0.5 * (1.0 + switching / smoothing)).clamp(0.0, 1.0)
+
+    def penalty(self, fraction: Tensor) -> Tensor:
+        return fraction * (fraction - 1.0)
+
+
+@dataclass(frozen=True)
+class Logarithmic:
+    """e = −ln η − ln(1−η): a barrier that keeps the control off both bounds (Bertrand and Epenoy)."""
+
+    def fraction(self, switching: Tensor, smoothing: Tensor) -> Tensor:
+        root = torch.sqrt(switching * switching + 4.0 * smoothing * smoothing)
+        # two forms of the same root of the quadratic, each free of cancellation on its side
+        return torch.where(
+            switching > 0,
+            1.0 - 2.0 * smoothing / (root + switching + 2.0 * smoothing),
+            2.0 * smoothing / (root - switching + 2.0 * smoothing),
+        )
+
+    def penalty(self, fraction: Tensor) -> Tensor:
+        return -torch.log(fraction) - torch.log1p(-fraction)
+
+
+# -- one bounded scalar ----------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Regime:
+    """How a bounded control is chosen: smoothed by ρ (..., 1), or pinned to arc codes (..., m)."""
+
+    smoothing: Tensor | None = None
+    arcs: Tensor | None = None
+
+
+def _fraction(at_lower: Tensor, at_upper: Tensor, curved: bool, law: Bounded, regime: Regime) -> Tensor:
+    """η (..., m) from S at both bounds: ``at_lower`` = S(η=0), ``at_upper`` = S(η=1), equal where H is affine."""
+    if curved:
+        curvature = at_lower - at_upper
+        free = at_lower / torch.where(curvature > 0, curvature, torch.ones_like(curvature))
+        smooth = free.clamp(0.0, 1.0)
+    elif regime.arcs is None:
+        if regime.smoothing is None:
+            return (at_lower > 0).to(at_lower.dtype)
+        return law.regulariser.fraction(at_lower - law.switching_level, regime.smoothing)
+    else:
+        free = smooth = 0.5 * torch.ones_like(at_lower)
+    if regime.arcs is None:
+        return smooth
+    zero, one = torch.zeros_like(at_lower), torch.ones_like(at_lower)
+    return torch.where(regime.arcs == LOWER, zero, torch.where(regime.arcs == UPPER, one, free))
+
+
+# -- control sets ----------------------------------------------------------------------------------------------------
+
+
+class ControlSet(Protocol):
+    """The admissible controls and the minimiser of the Hamiltonian over them."""
+
+    @property
+    def names(self) -> dict[str, int]:
+        """Names and sizes of the controls that the dynamics read."""
+        ...
+
+    @property
+    def n_switching(self) -> int:
+        """Number of switching functions; 0 where the control has no bound."""
+        ...
+
+    def probe(self, one: Tensor) -> dict[str, Tensor]:
+        """An admissible control with the batch shape of ``one`` (..., 1)."""
+        ...
+
+    def adapted(self, h: Hamiltonian, cost: Hamiltonian, p: Any, one: Tensor, unit: float) -> ControlSet:
+        """A copy that knows, from probes of H and of the running cost, whether H is curved and what s is.
+
+        ``unit`` is the scale of H, in cost per time, where the running cost does not tell s.
+        """
+        ...
+
+    def minimise(self, h: Hamiltonian, p: Any, like: Tensor, regime: Regime) -> Minimiser:
+        """Minimise h; ``like`` is any (..., 1) tensor of the right shape, ``p`` the problem's parameters."""
+        ...
+
+    def penalty(self, minimiser: Minimiser, p: Any, smoothing: Tensor) -> Tensor:
+        """What the regulariser adds to the running cost, (..., 1)."""
+        ...
+
+    def arc_codes(self, switching: Tensor) -> Tensor:
+        """Arc codes (..., m) that the minimum principle asks for, from the switching functions."""
+        ...
+
+
+@dataclass(frozen=True)
+class Unconstrained:
+    """Control in ℝᵐ with H quadratic in it: u = −H_uu⁻¹ H_u(0), exact in one step."""
+
+    name: str
+    size: int
+
+    @property
+    def names(self) -> dict[str, int]:
+        return {self.name: self.size}
+
+    @property
+    def n_switching(self) -> int:
+        return 0
+
+    def probe(self, one: Tensor) -> dict[str, Tensor]:
+        return {self.name: one.expand(*one.shape[:-1], self.size)}
+
+    def adapted(self, h: Hamiltonian, cost: Hamiltonian, p: Any, one: Tensor, unit: float) -> Unconstrained:
+        # third difference along a generic ray: zero where H is quadratic in u
+        ray = [h(**{self.name: k * self.probe(one)[self.name]}) for k in (0.0, 1.0, 2.0, 3.0)]
+        third = ray[3] - 3 * ray[2] + 3 * ray[1] - ray[0]
+        if bool((third.abs() > 1e-9 * sum(r.abs() for r in ray)).any()):
+            raise ValueError(
+                f"control {self.name!r}: the Hamiltonian is not quadratic in it, so ∂H/∂u = 0 has no closed form"
+            )
+        return self
+
+    def minimise(self, h: Hamiltonian, p: Any, like: Tensor, regime: Regime) -> Minimiser:
+        gradient = grad(lambda u: h(**{self.name: u}).sum())
+        zero = torch.zeros_like(like).expand(*like.shape[:-1], self.size).contiguous()
+        at_zero = gradient(zero)
+        units = torch.eye(self.size, dtype=like.dtype, device=like.device)
+        # H is quadratic, so a unit step in the gradient is a column of H_uu
+        hessian = torch.stack([gradient(zero + unit) - at_zero for unit in units], -1)
+        u = -torch.linalg.solve(hessian, at_zero.unsqueeze(-1)).squeeze(-1)
+        none = like[..., :0]
+        return Minimiser({self.name: u}, none, none)
+
+    def penalty(self, minimiser: Minimiser, p: Any, smoothing: Tensor) -> Tensor:
+        return torch.zeros_like(smoothing)
+
+    def arc_codes(self, switching: Tensor) -> Tensor:
+        return torch.zeros_like(switching, dtype=torch.long)
+
+
+@dataclass(frozen=True)
+class Bounded:
+    """What thrust balls and boxes share: bounds (numbers, or names of parameters), a regulariser, a scale.
+
+    ``cost_rate`` is s per unit of control, in cost per time and control; found by a probe of H where it is None.
+    ``switching_level`` is S_c of the PoNN paper's eq. 45. ``curved`` is set by ``adapted``.
+    """
+
+    name: str
+    maximum: float | str
+    minimum: float | str = 0.0
+    regulariser: Regulariser = field(default_factory=Entropy)
+    switching_level: float = 0.0
+    cost_rate: float | None = None
+    curved: bool = False
+
+    def bounds(self, p: Any) -> tuple[Any, Any]:
+        low, high = (getattr(p, b) if isinstance(b, str) else b for b in (self.minimum, self.maximum))
+        return low, high
+
+    def arc_codes(self, switching: Tensor) -> Tensor:
+        if not self.curved:
+            return torch.where(switching > 0, UPPER, LOWER)
+        at_lower, at_upper = switching.chunk(2, -1)
+        return (at_lower > 0).long() + (at_upper > 0).long()
+
+    def penalty(self, minimiser: Minimiser, p: Any, smoothing: Tensor) -> Tensor:
+        if self.curved:
+            return torch.zeros_like(smoothing)
+        low, high = self.bounds(p)
+        eta = minimiser.fraction
+        reward = smoothing * self.regulariser.penalty(eta) + self.switching_level * eta
+        return (self.cost_rate * (high - low) * reward).sum(-1, keepdim=True)
+
+    def _switching(self, at_lower: Tensor, at_upper: Tensor) -> Tensor:
+        return torch.cat([at_lower, at_upper], -1) if self.curved else at_lower
+
+
+@dataclass(frozen=True)
+class ThrustBall(Bounded):
+    """A vector with minimum ≤ |T| ≤ maximum; dynamics read ``u.<name>`` (..., size) and ``u.<name>_magnitude`` (..., 1).
+
+    The two enter the Hamiltonian as independent arguments, H linear in the vector, so that no norm is differentiated:
+    the direction is −primer/|primer| with primer = ∂H/∂vector, and S = (|primer| − ∂H/∂magnitude)/cost_rate
+    (PoNN paper eq. 36–38).
+    """
+
+    size: int = 3
+
+    @property
+    def names(self) -> dict[str, int]:
+        return {self.name: self.size, f"{self.name}_magnitude": 1}
+
+    @property
+    def n_switching(self) -> int:
+        return 2 if self.curved else 1
+
+    def _controls(self, vector: Tensor, magnitude: Tensor) -> dict[str, Tensor]:
+        return {self.name: vector, f"{self.name}_magnitude": magnitude}
+
+    def probe(self, one: Tensor) -> dict[str, Tensor]:
+        return self._controls(one.expand(*one.shape[:-1], self.size) / self.size**0.5, one)
+
+    def adapted(self, h: Hamiltonian, cost: Hamiltonian, p: Any, one: Tensor, unit: float) -> ThrustBall:
+        low, high = (torch.as_tensor(b, dtype=one.dtype) for b in self.bounds(p))
+        if not bool(((0 <= low) & (low < high)).all()):
+            raise ValueError(f"{self.name}: minimum = {self.minimum}, maximum = {self.maximum}; 0 ≤ minimum < maximum")
+        zero = torch.zeros_like(one)
+        vector = zero.expand(*one.shape[:-1], self.size)
+        at = [h(**self._controls(vector, zero + k * high)) for k in (0.0, 0.5, 1.0)]
+        size = (at[2] - at[0]).abs() + 1e-4 * sum(a.abs() for a in at)
+        curved = bool(((at[2] - 2 * at[1] + at[0]).abs() > 1e-9 * size).any())
+        slope = ((cost(**self._controls(vector, zero + high)) - cost(**self._controls(vector, zero))) / high).flatten()
+        constant = float(slope.min()) > 0 and float(slope.max() - slope.min()) <= 1e-9 * float(slope.max())
+        rate = self.cost_rate or (float(slope[0]) if constant else unit / float(high.max()))
+        return replace(self, curved=curved, cost_rate=rate)
+
+    def minimise(self, h: Hamiltonian, p: Any, like: Tensor, regime: Regime) -> Minimiser:
+        low, high = self.bounds(p)
+        slopes = grad(lambda vector, magnitude: h(**self._controls(vector, magnitude)).sum(), argnums=(0, 1))
+        zero = torch.zeros_like(like)
+        vector = zero.expand(*like.shape[:-1], self.size)
+        primer, slope = slopes(vector, zero + low)
+        norm = torch.sqrt((primer * primer).sum(-1, keepdim=True))
+        at_lower = (norm - slope) / self.cost_rate
+        at_upper = (norm - slopes(vector, zero + high)[1]) / self.cost_rate if self.curved else at_lower
+        fraction = _fraction(at_lower, at_upper, self.curved, self, regime)
+        magnitude = low + (high - low) * fraction
+        control = self._controls(-magnitude * primer / norm, magnitude)
+        return Minimiser(control, self._switching(at_lower, at_upper), fraction)
+
+
+@dataclass(frozen=True)
+class Box(Bounded):
+    """Components with minimum ≤ u_i ≤ maximum, each entering H apart from the others (affine, or convex and separable)."""
+
+    size: int = 1
+
+    @property
+    def names(self) -> dict[str, int]:
+        return {self.name: self.size}
+
+    @property
+    def n_switching(self) -> int:
+        return (2 if self.curved else 1) * self.size
+
+    def probe(self, one: Tensor) -> dict[str, Tensor]:
+        return {self.name: one.expand(*one.shape[:-1], self.size)}
+
+    def adapted(self, h: Hamiltonian, cost: Hamiltonian, p: Any, one: Tensor, unit: float) -> Box:
+        low, high = (torch.as_tensor(b, dtype=one.dtype) for b in self.bounds(p))
+        if not bool((low < high).all()):
+            raise ValueError(f"{self.name}: minimum = {self.minimum}, maximum = {self.maximum}; minimum < maximum")
+        gradient = grad(lambda u: h(**{self.name: u}).sum())
+        zero = torch.zeros_like(one).expand(*one.shape[:-1], self.size).contiguous()
+        base, change, scale = gradient(zero + low), 0.0, 0.0
+        for i in range(self.size):
+            step = zero.clone()
+            step[..., i] = (high - low).flatten()[0]
+            difference = gradient(zero + low + step) - base
+            scale = max(scale, float(difference.abs().max()), 1e-12 * float(base.abs().max()))
+            change = max(change, float(difference[..., i].abs().max()))
+            difference[..., i] = 0.0
+            if float(difference.abs().max()) > 1e-9 * scale:
+                raise ValueError(f"{self.name}: the Hamiltonian couples its components; a box needs a separable H")
+        curved = change > 1e-9 * float(base.abs().max())
+        rate = self.cost_rate or unit / float((high - low).max())
+        return replace(self, curved=curved, cost_rate=rate)
+
+    def minimise(self, h: Hamiltonian, p: Any, like: Tensor, regime: Regime) -> Minimiser:
+        low, high = self.bounds(p)
+        gradient = grad(lambda u: h(**{self.name: u}).sum())
+        zero = torch.zeros_like(like).expand(*like.shape[:-1], self.size)
+        at_lower = -gradient(zero + low) / self.cost_rate
+        at_upper = -gradient(zero + high) / self.cost_rate if self.curved else at_lower
+        fraction = _fraction(at_lower, at_upper, self.curved, self, regime)
+        return Minimiser({self.name: low + (high - low) * fraction}, self._switching(at_lower, at_upper), fraction)

@@ -1,0 +1,347 @@
+"""Pontryagin's principle by autodiff: an optimal control problem becomes a two-point boundary value problem.
+
+With H = L + λᵀf (minimised), the state–costate equations are ẋ = f and λ̇ = −∂H/∂x at the minimising control. All
+unknowns are scaled: w = (y, μ) with state x = ψ(y) elementwise and costate λ = c μ / ψ'(y), c the constant
+costate unit × state unit. ψ is x = unit · y, or the exponential of a mass variable; either way (y, μ) is canonical up
+to the constants c, so the costs, S and the control law stay those of the user's own variables.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.func import grad, vjp
+
+from ponn_torch.optimal_control.control_laws import ControlSet, Minimiser, Regime
+from ponn_torch.optimal_control.problem import Named, OptimalControlProblem, nearest
+
+MASS_VARIABLES = ("mass", "log_mass", "delta_v")
+
+
+@dataclass(frozen=True)
+class Setting:
+    """What varies at run time: the control regime and the problem's parameters, each (..., 1) on the points."""
+
+    regime: Regime = field(default_factory=Regime)
+    parameters: Mapping[str, Tensor] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Chain:
+    """Consecutive derivatives: d/dt w[columns[e]] ≡ k w[columns[e+1]]; factors[e] y with y = w[columns[0]].
+
+    d^e y/dt^e = factors[e] · w[columns[e]]. ``trivial``: the last derivative vanishes identically, so y is a
+    polynomial in time (constant gravity: λr constant, λv linear).
+    """
+
+    columns: tuple[int, ...]
+    factors: tuple[float, ...]
+    trivial: bool = False
+
+
+@dataclass(frozen=True)
+class BoundaryValueProblem:
+    """State–costate equations ẇ = F(t, w) with what is known of w at both ends, scaled to O(1).
+
+    Attributes:
+        linear (2n,): scaled unit of a state with a linear map, unused for exponential ones.
+        exponent (n,): 0 for x = unit·y; ±1 for x = unit·exp(±y).
+        conjugate (n,): c = costate unit × state unit.
+        known_initial, known_final: (2n,) scaled values, NaN where unknown.
+    """
+
+    problem: OptimalControlProblem
+    law: ControlSet
+    mass_variable: str
+    unit: Tensor
+    exponent: Tensor
+    conjugate: Tensor
+    time_unit: float
+    cost_unit: float
+    known_initial: Tensor
+    known_final: Tensor
+    n_multipliers: int = 0
+    chains: tuple[Chain, ...] = ()
+
+    # -- scaling -----------------------------------------------------------------------------------------------
+
+    @property
+    def n_states(self) -> int:
+        return self.problem.n_states
+
+    @property
+    def dimension(self) -> int:
+        return 2 * self.n_states
+
+    @property
+    def final_time(self) -> float:
+        """Scaled final time, or its guess."""
+        return self.problem.time_guess / self.time_unit
+
+    def _psi(self, y: Tensor) -> tuple[Tensor, Tensor]:
+        """ψ(y) and ψ'(y)."""
+        if not bool(self._has_exponential):
+            return self.unit * y, self.unit.expand_as(y)
+        curved = self.exponent != 0
+        exponential = self.unit * torch.exp(torch.where(curved, self.exponent * y, torch.zeros_like(y)))
+        return (
+            torch.where(curved, exponential, self.unit * y),
+            torch.where(curved, self.exponent * exponential, self.unit.expand_as(y)),
+        )
+
+    @property
+    def _has_exponential(self) -> bool:
+        return self.mass_variable != "mass"
+
+    def to_physical(self, w: Tensor) -> tuple[Tensor, Tensor]:
+        """States and costates in the user's units from w (..., 2n)."""
+        y, mu = w[..., : self.n_states], w[..., self.n_states :]
+        x, slope = self._psi(y)
+        return x, self.conjugate * mu / slope
+
+    def to_scaled(self, x: Tensor, costates: Tensor) -> Tensor:
+        """Inverse of ``to_physical``."""
+        curved = self.exponent != 0
+        ratio = torch.where(curved, x / self.unit, torch.ones_like(x))
+        y = torch.where(curved, self.exponent * torch.log(ratio), x / self.unit)
+        return torch.cat([y, costates * self._psi(y)[1] / self.conjugate], -1)
+
+    # -- the Hamiltonian and what follows from it ----------------------------------------------------------------
+
+    def _hamiltonian(self, t: Tensor, x: Tensor, costates: Tensor, u: Any, p: Any) -> tuple[Tensor, Tensor]:
+        """(H (..., 1), f (..., n)) in the user's units, unregularised."""
+        problem = self.problem
+        state = problem.named(x)
+        rates = problem.stack(problem.dynamics(t, state, u, p), x)
+        h = (costates * rates).sum(-1, keepdim=True)
+        if problem.running_cost is not None:
+            h = h + problem.running_cost(t, state, u, p)
+        return h, rates
+
+    def minimiser(self, t: Tensor, w: Tensor, setting: Setting) -> Minimiser:
+        """Control that minimises H at (t, w); t (..., 1) and w (..., 2n) scaled, control in the user's units."""
+        x, costates = self.to_physical(w)
+        p, time = Named(**setting.parameters), t * self.time_unit
+
+        def h(**u: Tensor) -> Tensor:
+            return self._hamiltonian(time, x, costates, Named(**u), p)[0]
+
+        return self.law.minimise(h, p, w[..., :1], setting.regime)
+
+    def rates(self, t: Tensor, w: Tensor, setting: Setting) -> Tensor:
+        """F(t, w): scaled rates (..., 2n) of states and costates."""
+        n = self.n_states
+        u = Named(**self.minimiser(t, w, setting).control)
+        p, time, mu = Named(**setting.parameters), t * self.time_unit, w[..., n:]
+
+        def h(y: Tensor) -> tuple[Tensor, tuple[Tensor, Tensor]]:
+            x, slope = self._psi(y)
+            value, rates = self._hamiltonian(time, x, self.conjugate * mu / slope, u, p)
+            return value.sum(), (rates, slope)
+
+        gradient, (rates, slope) = grad(h, has_aux=True)(w[..., :n])
+        return self.time_unit * torch.cat([rates / slope, -gradient / self.conjugate], -1)
+
+    def switching(self, t: Tensor, w: Tensor, setting: Setting) -> Tensor:
+        """Switching functions (..., m), positive where more control is better."""
+        return self.minimiser(t, w, setting).switching
+
+    def hamiltonian(self, t: Tensor, w: Tensor, setting: Setting) -> Tensor:
+        """The Hamiltonian (..., 1) that the setting's law minimises, regulariser included, in cost_unit/time_unit."""
+        x, costates = self.to_physical(w)
+        p, best = Named(**setting.parameters), self.minimiser(t, w, setting)
+        h = self._hamiltonian(t * self.time_unit, x, costates, Named(**best.control), p)[0]
+        if setting.regime.smoothing is not None and setting.regime.arcs is None:
+            h = h + self.law.penalty(best, p, setting.regime.smoothing)
+        return h * (self.time_unit / self.cost_unit)
+
+    def running_cost(self, t: Tensor, w: Tensor, setting: Setting) -> Tensor:
+        """The user's running cost (..., 1), without the regulariser, in cost_unit/time_unit."""
+        problem, p = self.problem, Named(**setting.parameters)
+        if problem.running_cost is None:
+            return torch.zeros_like(w[..., :1])
+        u = Named(**self.minimiser(t, w, setting).control)
+        state = problem.named(self.to_physical(w)[0])
+        return problem.running_cost(t * self.time_unit, state, u, p) * (self.time_unit / self.cost_unit)
+
+    # -- the end of the trajectory --------------------------------------------------------------------------------
+
+    @property
+    def terminal_components(self) -> list[int]:
+        """Free final states whose costate a terminal cost or a manifold determines."""
+        problem = self.problem
+        if problem.terminal_cost is None and problem.terminal_manifold is None:
+            return []
+        return [i for i, value in enumerate(problem.boundary("final")) if value is None]
+
+    @property
+    def n_terminal_rows(self) -> int:
+        return len(self.terminal_components) + self.n_multipliers + int(self.problem.free_final_time)
+
+    def terminal_rows(self, t: Tensor, w: Tensor, multipliers: Tensor, setting: Setting) -> Tensor:
+        """Rows (..., n_terminal_rows) that vanish at the end: λ − φ_x − ψ_xᵀν, ψ, and H + φ_t + νᵀψ_t for free tf."""
+        problem, p = self.problem, Named(**setting.parameters)
+        x, costates = self.to_physical(w)
+        time, rows = t * self.time_unit, []
+
+        def end_function(time: Tensor, x: Tensor) -> tuple[Tensor, Tensor]:
+            """φ + νᵀψ, which plays the part of the terminal cost, and ψ."""
+            total, psi = torch.zeros_like(time[..., 0]), x[..., :0]
+            if problem.terminal_cost is not None:
+                total = total + problem.terminal_cost(time, problem.named(x), p)[..., 0]
+            if problem.terminal_manifold is not None:
+                psi = problem.terminal_manifold(time, problem.named(x), p)
+                total = total + self.cost_unit * (multipliers * psi).sum(-1)
+            return total, psi
+
+        (_, psi), pull = vjp(end_function, time, x)
+        phi_t, phi_x = pull((torch.ones_like(time[..., 0]), torch.zeros_like(psi)))
+        if self.terminal_components:
+            index = self.terminal_components
+            unit = (self.conjugate / self._psi(w[..., : self.n_states])[1])[..., index]
+            rows.append((costates[..., index] - phi_x[..., index]) / unit)
+        if self.n_multipliers:
+            rows.append(psi)
+        if problem.free_final_time:
+            rows.append(self.hamiltonian(t, w, setting) + phi_t * (self.time_unit / self.cost_unit))
+        return torch.cat(rows, -1) if rows else w[..., :0]
+
+
+# -- building ------------------------------------------------------------------------------------------------------------
+
+
+def pontryagin(
+    problem: OptimalControlProblem,
+    *,
+    mass_variable: str = "mass",
+    chains: bool = True,
+    dtype: torch.dtype = torch.float64,
+    device: torch.device | str = "cpu",
+) -> BoundaryValueProblem:
+    """Derive the boundary value problem; ``mass_variable`` is one of MASS_VARIABLES, ``chains`` merges ṙ = v.
+
+    Raises:
+        ValueError: unknown mass variable, or one asked of a problem that names no mass.
+    """
+    if mass_variable not in MASS_VARIABLES:
+        raise ValueError(f"mass_variable = {mass_variable!r}; {nearest(mass_variable, MASS_VARIABLES)}")
+    if mass_variable != "mass" and problem.mass is None:
+        raise ValueError(f"mass_variable = {mass_variable!r}, but problem {problem.name!r} names no mass")
+
+    def tensor(values: list[float]) -> Tensor:
+        return torch.tensor(values, dtype=dtype, device=device)
+
+    sizes = problem.states.items()
+    unit = [problem.unit(name) for name, size in sizes for _ in range(size)]
+    conjugate = [problem.costate_unit(name) * problem.unit(name) for name, size in sizes for _ in range(size)]
+    exponent = [0.0] * problem.n_states
+    if problem.mass is not None and mass_variable != "mass":
+        exponent[problem.slices[problem.mass].start] = {"log_mass": 1.0, "delta_v": -1.0}[mass_variable]
+
+    bvp = BoundaryValueProblem(
+        problem=problem,
+        law=problem.control,
+        mass_variable=mass_variable,
+        unit=tensor(unit),
+        exponent=tensor(exponent),
+        conjugate=tensor(conjugate),
+        time_unit=float(problem.units.get("time", 1.0)),
+        cost_unit=float(problem.units.get("cost", 1.0)),
+        known_initial=tensor([]),
+        known_final=tensor([]),
+    )
+    bvp = replace(bvp, **_boundary(bvp), law=_adapted_law(bvp))
+    return replace(bvp, chains=find_chains(bvp) if chains else _single_chains(bvp))
+
+
+def _boundary(bvp: BoundaryValueProblem) -> dict[str, Any]:
+    """Known ends of w, scaled: given states; zero costates where a state is free and nothing is paid for it."""
+    problem, out = bvp.problem, {}
+    fixed_by_rows = set(bvp.terminal_components)
+    for end in ("initial", "final"):
+        values = problem.boundary(end)
+        like = torch.tensor([1.0 if v is None else v for v in values], dtype=bvp.unit.dtype, device=bvp.unit.device)
+        if bool(((bvp.exponent != 0) & (like <= 0)).any()):
+            raise ValueError(f"{problem.name}: {end} mass must be positive for mass_variable={bvp.mass_variable!r}")
+        w = bvp.to_scaled(like, torch.zeros_like(like))
+        for i, value in enumerate(values):
+            if value is None:
+                w[i] = torch.nan
+                if end == "final" and i in fixed_by_rows:
+                    w[bvp.n_states + i] = torch.nan
+            else:
+                w[bvp.n_states + i] = torch.nan
+        out[f"known_{end}"] = w
+    if problem.terminal_manifold is not None:
+        one, p = _probe_points(bvp, 2)[0], Named(**{k: torch.full((2, 1), v) for k, v in problem.parameters.items()})
+        psi = problem.terminal_manifold(one, problem.named(bvp.unit.expand(2, -1)), p)
+        out["n_multipliers"] = psi.shape[-1]
+    return out
+
+
+def _probe_points(bvp: BoundaryValueProblem, count: int, seed: int = 0) -> tuple[Tensor, Tensor]:
+    """Random (t, w) of order one for structural probes, away from zeros."""
+    generator = torch.Generator().manual_seed(seed)
+    values = 0.5 + torch.rand(count, 1 + bvp.dimension, generator=generator, dtype=torch.float64)
+    values = values.to(bvp.unit)
+    return values[:, :1], values[:, 1:]
+
+
+def _parameters(bvp: BoundaryValueProblem, like: Tensor) -> dict[str, Tensor]:
+    return {name: torch.full_like(like, value) for name, value in bvp.problem.parameters.items()}
+
+
+def _adapted_law(bvp: BoundaryValueProblem) -> ControlSet:
+    t, w = _probe_points(bvp, 8)
+    x, costates = bvp.to_physical(w)
+    p = Named(**_parameters(bvp, t))
+
+    def cost(**u: Tensor) -> Tensor:
+        return bvp._hamiltonian(t * bvp.time_unit, x, torch.zeros_like(costates), Named(**u), p)[0]
+
+    def h(**u: Tensor) -> Tensor:
+        return bvp._hamiltonian(t * bvp.time_unit, x, costates, Named(**u), p)[0]
+
+    return bvp.law.adapted(h, cost, p, t, bvp.cost_unit / bvp.time_unit)
+
+
+def _single_chains(bvp: BoundaryValueProblem) -> tuple[Chain, ...]:
+    return tuple(Chain((i,), (1.0,)) for i in range(bvp.dimension))
+
+
+def find_chains(bvp: BoundaryValueProblem, n_probes: int = 32) -> tuple[Chain, ...]:
+    """Find F_i ≡ k w_j by evaluating F at random points, join them, and mark chains whose last rate is zero."""
+    t, w = _probe_points(bvp, n_probes)
+    smoothing = 0.3 + t
+    rates = bvp.rates(t, w, Setting(Regime(smoothing=smoothing), _parameters(bvp, t)))
+    scale = rates.abs().amax().clamp_min(1.0)
+    follows: dict[int, tuple[int, float]] = {}
+    for i in range(bvp.dimension):
+        for j in range(bvp.dimension):
+            ratio = rates[:, i] / w[:, j]
+            k = float(ratio.mean())
+            if i != j and abs(k) > 1e-12 and float((rates[:, i] - k * w[:, j]).abs().max()) < 1e-12 * abs(k):
+                follows[i] = (j, k)
+    taken = {j for j, _ in follows.values()}
+    zero = rates.abs().amax(0) < 1e-14 * scale
+    out, used = [], set()
+    # a chain starts where nothing leads to it; what remains after that can only be a cycle (ẋ = λ, λ̇ = x), cut anywhere
+    for i in [*(i for i in range(bvp.dimension) if i not in taken), *range(bvp.dimension)]:
+        if i in used:
+            continue
+        columns, factors = [i], [1.0]
+        used.add(i)
+        while columns[-1] in follows and follows[columns[-1]][0] not in used:
+            j, k = follows[columns[-1]]
+            columns.append(j)
+            factors.append(factors[-1] * k)
+            used.add(j)
+        out.append(Chain(tuple(columns), tuple(factors), bool(zero[columns[-1]])))
+    return tuple(sorted(out, key=lambda chain: chain.columns))
+
+
+RatesFunction = Callable[[Tensor, Tensor, Setting], Tensor]

@@ -1,0 +1,214 @@
+"""The optimal control problem as a user states it: names, dynamics, costs, boundary data, controls, units."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from difflib import get_close_matches
+from types import SimpleNamespace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from ponn_torch.optimal_control.control_laws import ControlSet
+
+StateValues = Mapping[str, float | Sequence[float | None] | None]
+
+
+class Named(SimpleNamespace):
+    """Named blocks of a vector: ``x.r`` is the slice of the last axis called ``r``, shape (..., size)."""
+
+    def __getattr__(self, name: str) -> Any:
+        raise AttributeError(f"no entry named {name!r}; {nearest(name, vars(self))}")
+
+
+def nearest(name: str, allowed: Mapping[str, Any] | Sequence[str]) -> str:
+    """Say what is allowed and, where one is close, which name was probably meant."""
+    close = get_close_matches(name, list(allowed), n=1)
+    hint = f" (did you mean {close[0]!r}?)" if close else ""
+    return f"allowed: {', '.join(allowed)}{hint}"
+
+
+@dataclass(frozen=True)
+class FreeTime:
+    """A final time to be found; ``guess`` (s) starts the search."""
+
+    guess: float
+
+
+@dataclass(frozen=True)
+class DisplayUnit:
+    """A unit that people read: ``value_in_unit = value_in_SI / size``."""
+
+    label: str
+    size: float = 1.0
+
+
+@dataclass(frozen=True)
+class OptimalControlProblem:
+    """Minimise terminal_cost + ∫ running_cost dt subject to ẋ = dynamics(t, x, u, p), u in the control set.
+
+    The functions are pointwise and broadcast: ``x.r`` has shape (..., 3), ``t`` has shape (..., 1), and so has
+    a scalar state. ``dynamics`` returns a mapping from state names to rates, ``running_cost`` a tensor
+    (..., 1). Everything is in SI (or any consistent) units; ``units`` and ``costate_units`` make the unknowns
+    of the solver O(1) and are applied and undone by the package.
+
+    Attributes:
+        states: name → size, in order.
+        control: the admissible set; it names the control and knows how to minimise the Hamiltonian.
+        initial, final: name → value, or a sequence with None for free components; a missing name is free.
+        final_time: seconds, or FreeTime(guess).
+        units: state name → unit; ``time`` and ``cost`` besides.
+        costate_units: state name → unit of its costate (default cost / state unit).
+        terminal_cost: φ(t, x, p) → (..., 1), or None.
+        terminal_manifold: ψ(t, x, p) → (..., k) that must vanish at the end, or None.
+        parameters: named numbers that may be varied at run time (continuation, batches): ``p.name``.
+        mass: name of the state that a change of mass variable applies to, with ``exhaust_velocity`` in m/s.
+        known_cost: the optimum in SI where it is known, for reports.
+    """
+
+    name: str
+    states: Mapping[str, int]
+    control: ControlSet
+    dynamics: Callable[..., Mapping[str, Tensor]]
+    initial: StateValues
+    final: StateValues
+    final_time: float | FreeTime
+    running_cost: Callable[..., Tensor] | None = None
+    terminal_cost: Callable[..., Tensor] | None = None
+    terminal_manifold: Callable[..., Tensor] | None = None
+    units: Mapping[str, float] = field(default_factory=dict)
+    costate_units: Mapping[str, float] = field(default_factory=dict)
+    parameters: Mapping[str, float] = field(default_factory=dict)
+    mass: str | None = None
+    exhaust_velocity: float | None = None
+    cost_name: str = "cost"
+    known_cost: float | None = None
+    display: Mapping[str, DisplayUnit] = field(default_factory=dict)
+    description: str = ""
+
+    def __post_init__(self) -> None:
+        for label, mapping, extra in (
+            ("initial", self.initial, ()),
+            ("final", self.final, ()),
+            ("units", self.units, ("time", "cost")),
+            ("costate_units", self.costate_units, ()),
+        ):
+            allowed = [*self.states, *extra]
+            for name in mapping:
+                if name not in allowed:
+                    raise ValueError(f"{self.name}: {label} names {name!r}; {nearest(name, allowed)}")
+        for label, mapping in (("units", self.units), ("costate_units", self.costate_units)):
+            for name, value in mapping.items():
+                if not (math.isfinite(value) and value > 0):
+                    raise ValueError(f"{self.name}: {label}[{name!r}] = {value}; a positive number is needed")
+        guess = self.final_time.guess if isinstance(self.final_time, FreeTime) else self.final_time
+        if not (math.isfinite(guess) and guess > 0):
+            raise ValueError(f"{self.name}: final_time = {guess} s; a positive number is needed")
+        if self.running_cost is None and self.terminal_cost is None and not self.free_final_time:
+            raise ValueError(f"{self.name}: running_cost and terminal_cost are both missing; nothing to minimise")
+        if self.mass is not None and self.mass not in self.states:
+            raise ValueError(f"{self.name}: mass = {self.mass!r}; {nearest(self.mass, self.states)}")
+        for label in ("initial", "final"):
+            self.boundary(label)
+        self._probe()
+
+    # -- sizes and slices ------------------------------------------------------------------------------------
+
+    @property
+    def n_states(self) -> int:
+        return sum(self.states.values())
+
+    @property
+    def free_final_time(self) -> bool:
+        return isinstance(self.final_time, FreeTime)
+
+    @property
+    def time_guess(self) -> float:
+        """Final time in s, or its first guess where it is free."""
+        return self.final_time.guess if isinstance(self.final_time, FreeTime) else float(self.final_time)
+
+    @property
+    def slices(self) -> dict[str, slice]:
+        out, start = {}, 0
+        for name, size in self.states.items():
+            out[name] = slice(start, start + size)
+            start += size
+        return out
+
+    @property
+    def component_names(self) -> list[str]:
+        """One name per scalar state: r_1, r_2, r_3, …, m."""
+        return [
+            name if size == 1 else f"{name}_{i + 1}"
+            for name, size in self.states.items()
+            for i in range(size)
+        ]
+
+    def named(self, x: Tensor) -> Named:
+        """View a state vector (..., n_states) by the names of its blocks."""
+        return Named(**{name: x[..., s] for name, s in self.slices.items()})
+
+    def stack(self, blocks: Mapping[str, Tensor], like: Tensor) -> Tensor:
+        """Inverse of ``named`` for rates: blocks broadcast against ``like`` (..., n_states)."""
+        return torch.cat(
+            [
+                torch.as_tensor(blocks[name], dtype=like.dtype, device=like.device).expand(*like.shape[:-1], size)
+                for name, size in self.states.items()
+            ],
+            -1,
+        )
+
+    def unit(self, name: str) -> float:
+        return float(self.units.get(name, 1.0))
+
+    def costate_unit(self, name: str) -> float:
+        return float(self.costate_units.get(name, self.unit("cost") / self.unit(name)))
+
+    def boundary(self, end: str) -> list[float | None]:
+        """Known values per scalar state at ``initial`` or ``final``; None where free. SI."""
+        given: StateValues = getattr(self, end)
+        out: list[float | None] = []
+        for name, size in self.states.items():
+            value = given.get(name)
+            entries = list(value) if isinstance(value, Sequence) else [value] * size
+            if len(entries) != size:
+                raise ValueError(f"{self.name}: {end}[{name!r}] has {len(entries)} entries; {size} are needed")
+            for entry in entries:
+                if entry is not None and not math.isfinite(entry):
+                    raise ValueError(f"{self.name}: {end}[{name!r}] = {value}; finite numbers or None are needed")
+            out += [None if entry is None else float(entry) for entry in entries]
+        return out
+
+    def with_boundary(self, **changes: Any) -> OptimalControlProblem:
+        """A copy with other boundary data, final time or known cost (dataclasses.replace)."""
+        return replace(self, **changes)
+
+    # -- checks ----------------------------------------------------------------------------------------------
+
+    def _probe(self) -> None:
+        """Call the user's functions once with shapes (5, ·), so that a slip is named here, not in the solver."""
+        generator = torch.Generator().manual_seed(0)
+        one = torch.ones(5, 1, dtype=torch.float64)
+        unit = torch.tensor([self.unit(n) for n, s in self.states.items() for _ in range(s)], dtype=torch.float64)
+        x = unit * (0.5 + torch.rand(5, self.n_states, generator=generator, dtype=torch.float64))
+        p = Named(**{k: one * v for k, v in self.parameters.items()})
+        u = Named(**self.control.probe(one))
+        rates = self.dynamics(one, self.named(x), u, p)
+        for name in rates:
+            if name not in self.states:
+                raise ValueError(f"{self.name}: dynamics returns {name!r}; {nearest(name, self.states)}")
+        for name, size in self.states.items():
+            if name not in rates:
+                raise ValueError(f"{self.name}: dynamics returns no rate for {name!r}")
+            shape = tuple(rates[name].shape)
+            if shape[-1:] != (size,):
+                raise ValueError(f"{self.name}: dynamics[{name!r}] has shape {shape}; (..., {size}) is needed")
+        for label, function, args in (
+            ("running_cost", self.running_cost, (one, self.named(x), u, p)),
+            ("terminal_cost", self.terminal_cost, (one, self.named(x), p)),
+        ):
+            if function is not None and tuple(function(*args).shape) != (5, 1):
+                raise ValueError(f"{self.name}: {label} returns shape {tuple(function(*args).shape)}; (..., 1) is needed")

@@ -1,0 +1,72 @@
+"""Fuel-optimal low-thrust rendezvous from Earth to Mars in fixed time (PoNN paper, section 4.1)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+
+from ponn_torch.optimal_control.control_laws import Entropy, Regulariser, ThrustBall
+from ponn_torch.optimal_control.problem import DisplayUnit, Named, OptimalControlProblem
+from ponn_torch.problems.constants import ASTRONOMICAL_UNIT, DAY, KILOMETRE, STANDARD_GRAVITY, SUN_GM
+
+TIME_UNIT = 58.132 * DAY
+OPTIMUM_KG = 396.05984393
+
+
+def earth_mars(
+    *,
+    initial_position_km: Sequence[float] = (-140699693.0, -51614428.0, 980.0),
+    initial_velocity_km_s: Sequence[float] = (9.774596, -28.07828, 4.337725e-4),
+    final_position_km: Sequence[float] = (-172682023.0, 176959469.0, 7948912.0),
+    final_velocity_km_s: Sequence[float] = (-16.427384, -14.860506, 9.21486e-2),
+    initial_mass: float = 1000.0,
+    final_time_days: float = 348.795,
+    maximum_thrust: float = 0.5,
+    minimum_thrust: float = 0.0,
+    specific_impulse: float = 2000.0,
+    regulariser: Regulariser | None = None,
+    switching_level: float = 0.0,
+    known_cost: float | None = OPTIMUM_KG,
+) -> OptimalControlProblem:
+    """Heliocentric two-body transfer minimising fuel; thrust in N, Isp in s, mass in kg."""
+    alpha = 1.0 / (specific_impulse * STANDARD_GRAVITY)  # kg per N s
+    speed_unit = ASTRONOMICAL_UNIT / TIME_UNIT
+
+    def dynamics(t: torch.Tensor, x: Named, u: Named, p: Named) -> dict[str, torch.Tensor]:
+        distance = torch.sqrt((x.r * x.r).sum(-1, keepdim=True))
+        return {
+            "r": x.v,
+            "v": -SUN_GM * x.r / distance**3 + u.thrust / x.m,
+            "m": -alpha * u.thrust_magnitude,
+        }
+
+    return OptimalControlProblem(
+        name="earth_mars",
+        description="Earth–Mars rendezvous, fixed time, minimum fuel",
+        states={"r": 3, "v": 3, "m": 1},
+        control=ThrustBall(
+            "thrust", maximum_thrust, minimum_thrust, regulariser or Entropy(), switching_level, size=3
+        ),
+        dynamics=dynamics,
+        running_cost=lambda t, x, u, p: alpha * u.thrust_magnitude,
+        initial={
+            "r": [KILOMETRE * c for c in initial_position_km],
+            "v": [KILOMETRE * c for c in initial_velocity_km_s],
+            "m": initial_mass,
+        },
+        final={"r": [KILOMETRE * c for c in final_position_km], "v": [KILOMETRE * c for c in final_velocity_km_s]},
+        final_time=final_time_days * DAY,
+        units={"r": ASTRONOMICAL_UNIT, "v": speed_unit, "m": initial_mass, "time": TIME_UNIT, "cost": initial_mass},
+        mass="m",
+        cost_name="fuel",
+        known_cost=known_cost,
+        display={
+            "time": DisplayUnit("d", DAY),
+            "r": DisplayUnit("km", KILOMETRE),
+            "v": DisplayUnit("km/s", KILOMETRE),
+            "m": DisplayUnit("kg"),
+            "cost": DisplayUnit("kg"),
+            "thrust": DisplayUnit("N"),
+        },
+    )

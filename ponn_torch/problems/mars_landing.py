@@ -1,0 +1,77 @@
+"""Fuel-optimal powered descent to Mars with canted engines (PoNN paper, section 4.2; TFC paper, tests 1 and 2)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import torch
+
+from ponn_torch.optimal_control.control_laws import Entropy, Regulariser, ThrustBall
+from ponn_torch.optimal_control.problem import DisplayUnit, FreeTime, Named, OptimalControlProblem
+from ponn_torch.problems.constants import STANDARD_GRAVITY
+
+OPTIMUM_KG = 268.0146563274
+
+
+def mars_landing(
+    *,
+    initial_position: Sequence[float] = (-200.0, 100.0, 1500.0),
+    initial_velocity: Sequence[float] = (85.0, -50.0, -65.0),
+    final_position: Sequence[float] = (0.0, 0.0, 0.0),
+    final_velocity: Sequence[float] = (0.0, 0.0, 0.0),
+    initial_mass: float = 1905.0,
+    final_time: float = 44.823,
+    free_final_time: bool = False,
+    minimum_thrust: float = 4971.81,
+    maximum_thrust: float = 13258.18,
+    specific_impulse: float = 225.0,
+    standard_gravity: float = STANDARD_GRAVITY,
+    cant_angle_degrees: float = 27.0,
+    mass_flow_per_thrust: float | None = None,
+    gravity: float = 3.7114,
+    regulariser: Regulariser | None = None,
+    switching_level: float = 0.0,
+    known_cost: float | None = OPTIMUM_KG,
+) -> OptimalControlProblem:
+    """Pinpoint landing in constant gravity, SI; altitude is not constrained.
+
+    The engines are canted, so the mass flow is α|T| with α = 1/(Isp g0 cos φ); ``mass_flow_per_thrust`` (kg per N s)
+    overrides it, as in the TFC paper's rounded 5.0863e-4.
+    """
+    cosine = math.cos(math.radians(cant_angle_degrees))
+    alpha = mass_flow_per_thrust or 1.0 / (specific_impulse * standard_gravity * cosine)
+    length = max(math.hypot(*initial_position), 1.0)
+    speed = length / final_time
+
+    def dynamics(t: torch.Tensor, x: Named, u: Named, p: Named) -> dict[str, torch.Tensor]:
+        down = x.v.new_tensor((0.0, 0.0, -gravity))
+        return {"r": x.v, "v": down + u.thrust / x.m, "m": -alpha * u.thrust_magnitude}
+
+    return OptimalControlProblem(
+        name="mars_landing",
+        description="Mars powered descent, minimum fuel",
+        states={"r": 3, "v": 3, "m": 1},
+        control=ThrustBall(
+            "thrust", maximum_thrust, minimum_thrust, regulariser or Entropy(), switching_level, size=3
+        ),
+        dynamics=dynamics,
+        running_cost=lambda t, x, u, p: alpha * u.thrust_magnitude,
+        initial={"r": list(initial_position), "v": list(initial_velocity), "m": initial_mass},
+        final={"r": list(final_position), "v": list(final_velocity)},
+        final_time=FreeTime(final_time) if free_final_time else final_time,
+        units={"r": length, "v": speed, "m": initial_mass, "time": final_time, "cost": initial_mass},
+        # S = |λv|/(α m) + λm − 1 is O(1), so |λv| is of the order of α m, a sixtieth of cost/speed here
+        costate_units={"r": alpha * initial_mass / final_time, "v": alpha * initial_mass, "m": 1.0},
+        mass="m",
+        cost_name="fuel",
+        known_cost=known_cost,
+        display={
+            "time": DisplayUnit("s"),
+            "r": DisplayUnit("m"),
+            "v": DisplayUnit("m/s"),
+            "m": DisplayUnit("kg"),
+            "cost": DisplayUnit("kg"),
+            "thrust": DisplayUnit("N"),
+        },
+    )
