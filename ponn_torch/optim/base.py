@@ -1,0 +1,128 @@
+"""What every optimiser shares: the residual it sees, the records it leaves, and the reason it stops."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from enum import Enum
+from typing import Any, Protocol
+
+import torch
+from torch import Tensor
+
+from ponn_torch.numerics.linalg import Jacobian
+
+
+class Status(Enum):
+    """Why an optimiser stopped; the value is the message."""
+
+    RESIDUAL = "the residual norm fell below the tolerance"
+    ROUND_OFF = "after the tolerance was met, the residual norm rose: round-off is reached"
+    SMALL_DECREASE = "the relative decrease stayed below its tolerance for several steps"
+    SMALL_STEP = "the relative step fell below its tolerance"
+    DAMPING = "no step decreased the residual up to the largest damping"
+    MAX_ITERATIONS = "the iteration limit was reached"
+    TIME_LIMIT = "the CPU time limit was reached"
+    HOPELESS = "the residual was still above the limit that tells a failed start"
+    NON_FINITE = "the residual is not finite at the starting point"
+    INTERRUPTED = "interrupted from the keyboard"
+
+    @property
+    def stationary(self) -> bool:
+        """The optimiser ended by itself at a point it cannot improve (not: a correct solution)."""
+        return self in _STATIONARY
+
+
+_STATIONARY = {Status.RESIDUAL, Status.ROUND_OFF, Status.SMALL_DECREASE, Status.SMALL_STEP, Status.DAMPING}
+
+
+class Residual(Protocol):
+    """Vector function r(ξ) (..., R) of a flat vector ξ (..., N); leading axes are independent problems."""
+
+    @property
+    def n_unknowns(self) -> int: ...
+
+    def residual(self, xi: Tensor) -> Tensor: ...
+
+    def linearise(self, xi: Tensor) -> tuple[Tensor, Jacobian]: ...
+
+    def blocks(self, residual: Tensor) -> Mapping[str, Tensor]: ...
+
+
+Record = Mapping[str, float | int | bool]
+Callback = Callable[[Record, Tensor, Tensor], None]  # (record, ξ, r) after every iteration
+
+
+@dataclass(frozen=True)
+class Stopping:
+    """When to stop; every rule names itself in the Status.
+
+    tolerance: on ‖r‖. decrease: relative decrease of ‖r‖² below which ``patience`` successive accepted steps end the
+    run. step: on ‖p‖/‖ξ‖ in scaled unknowns. past_tolerance: the papers' rule — when the tolerance is met, go on until
+    the norm rises (PoNN paper, after eq. 27). hopeless: after ``hopeless_after`` iterations a norm above it ends
+    the run. cpu_seconds: process CPU time.
+    """
+
+    tolerance: float = 1e-12
+    decrease: float = 1e-9
+    patience: int = 3
+    step: float = 0.0
+    max_iterations: int = 200
+    past_tolerance: bool = False
+    hopeless: float = float("inf")
+    hopeless_after: int = 10**9
+    cpu_seconds: float = float("inf")
+
+
+@dataclass(frozen=True)
+class OptimizeResult:
+    """The best point found (..., N), ‖r‖ there (...,), why it ended, a record per iteration, and evaluation counts."""
+
+    xi: Tensor
+    norm: Tensor
+    status: Status
+    records: list[Record] = field(default_factory=list)
+    n_residuals: int = 0
+    n_linearisations: int = 0
+    cpu_seconds: float = 0.0
+    member_status: tuple[Status, ...] = ()
+
+    @property
+    def n_iterations(self) -> int:
+        return len(self.records)
+
+
+class Optimizer(Protocol):
+    def run(self, residual: Residual, xi: Tensor, on_iteration: Callback | None = None) -> OptimizeResult: ...
+
+
+class NonFiniteResidual(FloatingPointError):
+    """The residual is not finite at a starting point; the message names equations."""
+
+
+def check_start(residual: Residual, value: Tensor) -> None:
+    """Raise NonFiniteResidual if the starting residual is not finite anywhere in the batch, naming the equations."""
+    if bool(torch.isfinite(value).all()):
+        return
+    bad = [name for name, norm in residual.blocks(value).items() if not bool(torch.isfinite(norm).all())]
+    raise NonFiniteResidual(
+        f"the residual is not finite at the starting point, in the equations of: {', '.join(bad)}; "
+        "start from a point where the dynamics are defined (other seed, distribution or guess)"
+    )
+
+
+class Stopwatch:
+    """CPU seconds of this process since it was made."""
+
+    def __init__(self) -> None:
+        self._start = time.process_time()
+
+    @property
+    def seconds(self) -> float:
+        return time.process_time() - self._start
+
+
+def record(**values: Any) -> Record:
+    """A record with plain Python numbers (tensors of one element are read out)."""
+    return {k: v.item() if isinstance(v, Tensor) else v for k, v in values.items()}

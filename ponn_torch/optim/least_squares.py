@@ -1,0 +1,311 @@
+"""Least squares: linear, Gauss–Newton, Levenberg–Marquardt, and SciPy's solvers behind the same call.
+
+Levenberg–Marquardt carries the batch axis: every member has its own damping, acceptance and status, and members that
+have ended are frozen. A trial step costs one residual; the Jacobian is formed at accepted points only.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+import torch
+from scipy.optimize import least_squares as scipy_least_squares
+from torch import Tensor
+
+from ponn_torch.numerics.linalg import LINEAR_SOLVERS, Jacobian
+from ponn_torch.optim.base import (
+    Callback,
+    OptimizeResult,
+    Residual,
+    Status,
+    Stopping,
+    Stopwatch,
+    check_start,
+    record,
+)
+
+_RUNNING = -1
+_CODES = list(Status)
+
+
+def _code(status: Status) -> int:
+    return _CODES.index(status)
+
+
+def _check_solver(linear_solver: str) -> None:
+    if linear_solver not in LINEAR_SOLVERS:
+        raise ValueError(f"linear_solver = {linear_solver!r}; allowed: {', '.join(LINEAR_SOLVERS)}")
+
+
+# -- scalings D of the damping ‖√μ D p‖ -------------------------------------------------------------------------------------
+
+
+def marquardt(norms: Tensor, previous: Tensor | None) -> Tensor:
+    """Column norms of the current Jacobian: the method does not see the units of the unknowns."""
+    return norms
+
+
+def more(norms: Tensor, previous: Tensor | None) -> Tensor:
+    """Largest column norms met so far (Moré), as in MINPACK."""
+    return norms if previous is None else torch.maximum(norms, previous)
+
+
+def identity(norms: Tensor, previous: Tensor | None) -> Tensor:
+    """One for all unknowns (Levenberg), in units of the first Jacobian's largest column."""
+    return norms.amax(-1, keepdim=True).expand_as(norms) if previous is None else previous
+
+
+SCALINGS = {"marquardt": marquardt, "more": more, "identity": identity}
+
+
+# -- Levenberg–Marquardt ------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class LevenbergMarquardt:
+    """Damped Gauss–Newton: ``scaling`` chooses D, Nielsen's rule moves μ, a step is taken only if ‖r‖ falls.
+
+    Attributes:
+        damping: first μ, relative to D² (1e-3 from a random start, 1e-8 near a solution).
+        scaling: one of SCALINGS. linear_solver: ``cholesky`` (fast) or ``qr`` (digits).
+        update: ``nielsen`` (gain ratio), or a number > 1: the constant factor of the classical rule.
+    """
+
+    stopping: Stopping = field(default_factory=Stopping)
+    damping: float = 1e-3
+    scaling: str = "marquardt"
+    linear_solver: str = "cholesky"
+    update: str | float = "nielsen"
+    smallest_damping: float = 1e-15
+    largest_damping: float = 1e12
+
+    def __post_init__(self) -> None:
+        _check_solver(self.linear_solver)
+        if self.scaling not in SCALINGS:
+            raise ValueError(f"scaling = {self.scaling!r}; allowed: {', '.join(SCALINGS)}")
+        if self.update != "nielsen" and not (isinstance(self.update, int | float) and self.update > 1):
+            raise ValueError(f"update = {self.update!r}; allowed: 'nielsen' or a factor above 1")
+        if not self.damping >= 0:
+            raise ValueError(f"damping = {self.damping}; allowed: a number ≥ 0")
+
+    def run(self, residual: Residual, xi: Tensor, on_iteration: Callback | None = None) -> OptimizeResult:
+        """Minimise ½‖r(ξ)‖² from ξ (..., N).
+
+        Raises:
+            NonFiniteResidual: r is not finite at the start.
+        """
+        rule, watch = self.stopping, Stopwatch()
+        r, jacobian = residual.linearise(xi)
+        check_start(residual, r)
+        cost = r.square().sum(-1)
+        scale = self._scale(jacobian, None)
+        damping = torch.full_like(cost, self.damping)
+        growth = torch.full_like(cost, 2.0)
+        code = torch.full(cost.shape, _RUNNING, dtype=torch.long, device=cost.device)
+        slow = torch.zeros_like(code)
+        records, n_residuals, n_linear = [], 0, 1
+        code = torch.where(cost.sqrt() < rule.tolerance, _code(Status.RESIDUAL), code)
+        interrupted = False
+        while bool((code == _RUNNING).any()):
+            try:
+                step = jacobian.solve_damped(r, damping, scale, self.linear_solver)
+                trial = xi + step
+                trial_r = residual.residual(trial)
+                n_residuals += 1
+                running = code == _RUNNING
+                trial_cost = trial_r.square().sum(-1)
+                accepted = running & (trial_cost < cost)  # NaN compares false: a non-finite step is rejected
+                # ‖r‖² − ‖r + J p‖² for the exact solution of the damped system
+                predicted = (step * (damping.unsqueeze(-1) * scale.square() * step - jacobian.gradient(r))).sum(-1)
+                gain = (cost - trial_cost) / predicted.clamp_min(torch.finfo(cost.dtype).tiny)
+                damping, growth = self._update(damping, growth, gain, accepted, running)
+                # a rejected step that promised next to nothing is as good as a small decrease: round-off is near
+                relative = torch.where(accepted, cost - trial_cost, predicted) / cost
+                step_norm = (scale * step).norm(dim=-1) / (scale * xi).norm(dim=-1).clamp_min(1e-300)
+                rises = running & ~accepted & (cost.sqrt() < rule.tolerance)
+                if bool(accepted.any()):
+                    xi = torch.where(accepted.unsqueeze(-1), trial, xi)
+                    cost = torch.where(accepted, trial_cost, cost)
+                slow = torch.where(relative < rule.decrease, slow + 1, torch.where(accepted, 0, slow))
+                norm = cost.sqrt()
+                met = (norm < rule.tolerance) & (not rule.past_tolerance)
+                iteration = len(records) + 1
+                records.append(
+                    record(
+                        iteration=iteration,
+                        norm=norm.median() if norm.dim() else norm,
+                        damping=damping.median() if norm.dim() else damping,
+                        step=step_norm.median() if norm.dim() else step_norm,
+                        accepted=accepted.any(),
+                        running=int(running.sum()),
+                        residuals=n_residuals,
+                        linearisations=n_linear,
+                        seconds=watch.seconds,
+                    )
+                )
+                if on_iteration is not None:
+                    on_iteration(records[-1], xi, torch.where(accepted.unsqueeze(-1), trial_r, r))
+                for condition, status in (
+                    (met, Status.RESIDUAL),
+                    (rises & rule.past_tolerance, Status.ROUND_OFF),
+                    (slow >= rule.patience, Status.SMALL_DECREASE),
+                    (accepted & (step_norm < rule.step), Status.SMALL_STEP),
+                    (damping > self.largest_damping, Status.DAMPING),
+                    ((norm > rule.hopeless) & (iteration >= rule.hopeless_after), Status.HOPELESS),
+                    (torch.tensor(iteration >= rule.max_iterations), Status.MAX_ITERATIONS),
+                    (torch.tensor(watch.seconds > rule.cpu_seconds), Status.TIME_LIMIT),
+                ):
+                    code = torch.where((code == _RUNNING) & condition, _code(status), code)
+                if bool(accepted.any()) and bool((code == _RUNNING).any()):
+                    r, jacobian = residual.linearise(xi)
+                    n_linear += 1
+                    scale = self._scale(jacobian, scale)
+            except KeyboardInterrupt:
+                interrupted = True
+                break
+        members = tuple(
+            Status.INTERRUPTED if c == _RUNNING else _CODES[c] for c in code.flatten().tolist()
+        )
+        return OptimizeResult(
+            xi=xi,
+            norm=cost.sqrt(),
+            status=Status.INTERRUPTED if interrupted else _common(members),
+            records=records,
+            n_residuals=n_residuals,
+            n_linearisations=n_linear,
+            cpu_seconds=watch.seconds,
+            member_status=members,
+        )
+
+    def _scale(self, jacobian: Jacobian, previous: Tensor | None) -> Tensor:
+        norms = jacobian.column_norms()
+        scale = SCALINGS[self.scaling](norms, previous)
+        return torch.maximum(scale, 1e-6 * scale.amax(-1, keepdim=True))
+
+    def _update(
+        self, damping: Tensor, growth: Tensor, gain: Tensor, accepted: Tensor, running: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """μ and its growth factor ν after a trial (Nielsen 1999), or by a constant factor."""
+        if self.update == "nielsen":
+            smaller = damping * (1.0 - (2.0 * gain - 1.0) ** 3).clamp_min(1.0 / 3.0)
+            larger, growth_after = damping * growth, 2.0 * growth
+            growth = torch.where(accepted, torch.full_like(growth, 2.0), growth_after)
+        else:
+            factor = float(self.update)
+            smaller, larger = damping / factor, damping * factor
+        # from μ = 0 there is no larger multiple: leave zero by the smallest damping
+        larger = larger.clamp_min(10 * self.smallest_damping)
+        moved = torch.where(accepted, smaller, larger).clamp_min(self.smallest_damping)
+        return torch.where(running, moved, damping), growth
+
+
+def _common(members: tuple[Status, ...]) -> Status:
+    """One status for a batch: the least favourable."""
+    order = [*(s for s in Status if not s.stationary), *(s for s in Status if s.stationary)]
+    return min(members, key=order.index)
+
+
+@dataclass(frozen=True)
+class GaussNewton:
+    """Undamped steps J p = −r by QR; ends when the norm rises. For problems that are linear, or nearly so."""
+
+    stopping: Stopping = field(default_factory=lambda: Stopping(max_iterations=20))
+    linear_solver: str = "qr"
+
+    def __post_init__(self) -> None:
+        _check_solver(self.linear_solver)
+
+    def run(self, residual: Residual, xi: Tensor, on_iteration: Callback | None = None) -> OptimizeResult:
+        inner = LevenbergMarquardt(self.stopping, damping=0.0, linear_solver=self.linear_solver, smallest_damping=0.0)
+        return inner.run(residual, xi, on_iteration)
+
+
+# -- SciPy ----------------------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class ScipyLeastSquares:
+    """scipy.optimize.least_squares on the same residual: ``trf`` (the PoNN paper's landing), ``lm`` or ``dogbox``."""
+
+    method: str = "trf"
+    stopping: Stopping = field(default_factory=Stopping)
+
+    def __post_init__(self) -> None:
+        if self.method not in ("trf", "lm", "dogbox"):
+            raise ValueError(f"method = {self.method!r}; allowed: trf, lm, dogbox")
+
+    def run(self, residual: Residual, xi: Tensor, on_iteration: Callback | None = None) -> OptimizeResult:
+        if xi.dim() != 1:
+            raise ValueError(f"xi has shape {tuple(xi.shape)}; scipy solves one problem, shape (N,), at a time")
+        rule, watch, records = self.stopping, Stopwatch(), []
+        check_start(residual, residual.residual(xi))
+        count = {"residuals": 0, "linearisations": 0}
+        best: list[tuple[float, Tensor]] = [(float("inf"), xi)]
+        stopped: list[Status] = []
+
+        def tensor(x: np.ndarray) -> Tensor:
+            return torch.as_tensor(x, dtype=xi.dtype, device=xi.device)
+
+        def function(x: np.ndarray) -> np.ndarray:
+            point = tensor(x.copy())
+            r = residual.residual(point)
+            count["residuals"] += 1
+            norm = float(r.norm())
+            improved = norm < best[0][0]
+            if improved:
+                best[0] = (norm, point)
+            records.append(
+                record(
+                    iteration=len(records) + 1, norm=best[0][0], damping=0.0, step=0.0, accepted=improved, running=1,
+                    residuals=count["residuals"], linearisations=count["linearisations"], seconds=watch.seconds,
+                )
+            )
+            if on_iteration is not None:
+                on_iteration(records[-1], best[0][1], r)
+            for condition, status in (
+                (norm < rule.tolerance, Status.RESIDUAL),
+                (watch.seconds > rule.cpu_seconds, Status.TIME_LIMIT),
+            ):
+                if condition:
+                    stopped.append(status)
+                    raise _Stop
+            return np.nan_to_num(r.detach().cpu().numpy(), nan=1e150, posinf=1e150, neginf=-1e150)
+
+        def jacobian(x: np.ndarray) -> np.ndarray:
+            count["linearisations"] += 1
+            return residual.linearise(tensor(x.copy()))[1].dense().cpu().numpy()
+
+        try:
+            out = scipy_least_squares(
+                function,
+                xi.cpu().numpy(),
+                jac=jacobian,
+                method=self.method,
+                x_scale="jac",
+                ftol=max(rule.decrease, 2.3e-16),
+                xtol=max(rule.step, 2.3e-16),
+                gtol=2.3e-16,
+                max_nfev=rule.max_iterations,
+            )
+            status = {0: Status.MAX_ITERATIONS, 2: Status.SMALL_DECREASE, 3: Status.SMALL_STEP}.get(
+                out.status, Status.SMALL_DECREASE
+            )
+        except _Stop:
+            status = stopped[-1]
+        except KeyboardInterrupt:
+            status = Status.INTERRUPTED
+        return OptimizeResult(
+            xi=best[0][1],
+            norm=xi.new_tensor(best[0][0]),
+            status=status,
+            records=records,
+            n_residuals=count["residuals"],
+            n_linearisations=count["linearisations"],
+            cpu_seconds=watch.seconds,
+            member_status=(status,),
+        )
+
+
+class _Stop(Exception):
+    """Ends SciPy's loop from inside the residual."""

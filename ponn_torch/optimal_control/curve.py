@@ -1,0 +1,100 @@
+"""The curve w(t) that a vector of unknowns stands for: evaluable anywhere, with its defect ẇ − F off the nodes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import torch
+from torch import Tensor
+
+from ponn_torch.optimal_control.collocation import Collocation, Unknowns
+from ponn_torch.optimal_control.control_laws import Regime
+from ponn_torch.optimal_control.pontryagin import Setting
+
+
+@dataclass(frozen=True, eq=False)
+class Curve:
+    """Scaled states and costates of one solved residual; ξ (N,), no batch axis.
+
+    At an interior knot the curve belongs to the segment on its right, the last knot to the last segment.
+    """
+
+    collocation: Collocation
+    xi: Tensor
+
+    @cached_property
+    def unknowns(self) -> Unknowns:
+        return self.collocation.unpack(self.xi)
+
+    @property
+    def times(self) -> Tensor:
+        """Scaled knot times (K+1,)."""
+        return self.unknowns.times
+
+    @property
+    def knots(self) -> Tensor:
+        """Scaled w at the knots (K+1, 2n)."""
+        return self.unknowns.knots
+
+    def segment_of(self, t: Tensor) -> Tensor:
+        """Index of the segment that contains each scaled time."""
+        interior = self.times[1:-1].contiguous()
+        return torch.searchsorted(interior, t.contiguous(), right=True)
+
+    def _jets(self, z: Tensor, segment: int) -> list[Tensor]:
+        """Per group the derivatives in z (d, q+1, m) at z (m,) of one segment."""
+        unknowns, out = self.unknowns, []
+        h = (self.times[1:] - self.times[:-1]) / 2
+        for group in self.collocation.discretisation.groups:
+            kappa, _ = self.collocation._kappa(group, unknowns, h)
+            beta = unknowns.weights[segment, group.own].unflatten(-1, (group.n_chains, group.size))
+            B, Omega = group.expression.tables(z, group.order)
+            out.append(torch.einsum("omk,dk->dom", torch.cat([B[..., : group.size], Omega], -1), torch.cat([beta, kappa[segment]], -1)))
+        return out
+
+    def on_segment(self, z: Tensor, segment: int) -> tuple[Tensor, Tensor, Tensor]:
+        """(t (m,), w (m, 2n), ẇ (m, 2n)) at z ∈ [−1, 1] of one segment; chained entries of ẇ are exact derivatives."""
+        h = (self.times[segment + 1] - self.times[segment]) / 2
+        w = self.xi.new_zeros(len(z), self.collocation.bvp.dimension)
+        rate = torch.zeros_like(w)
+        for group, jet in zip(self.collocation.discretisation.groups, self._jets(z, segment), strict=True):
+            for e in range(group.order):
+                scale = (h**e * group.factors[:, e])[:, None]
+                w[:, group.columns[:, e]] = (jet[:, e] / scale).mT
+                rate[:, group.columns[:, e]] = (jet[:, e + 1] / (h * scale)).mT
+        return self.times[segment] + h * (z + 1.0), w, rate
+
+    def __call__(self, t: Tensor) -> Tensor:
+        """w (m, 2n) at scaled times (m,)."""
+        index, out = self.segment_of(t), self.xi.new_zeros(len(t), self.collocation.bvp.dimension)
+        for k in range(self.collocation.n_segments):
+            here = index == k
+            if bool(here.any()):
+                start, end = self.times[k], self.times[k + 1]
+                out[here] = self.on_segment(2 * (t[here] - start) / (end - start) - 1, k)[1]
+        return out
+
+    def setting(self, segment: Tensor) -> Setting:
+        """The regime and parameters at points of the given segments (m,)."""
+        setting = self.collocation.setting
+        one = self.xi.new_ones(len(segment), 1)
+        smoothing, arcs = setting.regime.smoothing, setting.regime.arcs
+        regime = Regime(
+            None if smoothing is None else smoothing * one,
+            None if arcs is None else arcs[segment],
+        )
+        return Setting(regime, {k: v * one for k, v in setting.parameters.items()})
+
+    def defect(self, n_points: int = 200) -> tuple[Tensor, Tensor]:
+        """ẇ − F at scaled times off the nodes: (t (K·n,), (K·n, 2n)), on an even grid inside every segment."""
+        step = 2.0 / n_points
+        z = torch.linspace(-1 + step / 2, 1 - step / 2, n_points, dtype=self.xi.dtype, device=self.xi.device)
+        parts = [self.on_segment(z, k) for k in range(self.collocation.n_segments)]
+        t, w, rate = (torch.cat(items) for items in zip(*parts, strict=True))
+        segment = torch.arange(len(parts), device=self.xi.device).repeat_interleave(n_points)
+        return t, rate - self.collocation.bvp.rates(t[:, None], w, self.setting(segment))
+
+    def off_node_residual(self, n_points: int = 200) -> float:
+        """Largest |ẇ − F| off the nodes, in scaled units."""
+        return float(self.defect(n_points)[1].abs().max())
