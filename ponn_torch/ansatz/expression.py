@@ -15,35 +15,35 @@ from ponn_torch.ansatz.constraints import Constraint, SwitchingFunctions, apply,
 from ponn_torch.numerics.nodes import NodeSet
 
 
-def _identity(table: Tensor, round_off: Tensor, truncation: float) -> Tensor:
+def _identity(table: Tensor, magnitude: Tensor, truncation: float) -> Tensor:
     return torch.eye(table.shape[1], dtype=table.dtype, device=table.device)
 
 
-def _columns(table: Tensor, round_off: Tensor, truncation: float) -> Tensor:
-    """Unit columns, without those that the constraints reduce to round-off."""
+def _columns(table: Tensor, magnitude: Tensor, truncation: float) -> Tensor:
+    """Unit columns, without those that constraints reduce to round-off (fewer than half the digits left)."""
     norms = table.norm(dim=0)
-    known = round_off < truncation * norms
+    known = norms > torch.finfo(table.dtype).eps ** 0.5 * magnitude
     if not known.any():
-        raise ValueError(
-            f"all {len(known)} free functions are spanned by the constraints; allowed: a larger basis"
-        )
+        raise ValueError(f"basis of size {len(known)} is spanned by the constraints; allowed: a larger one")
     return torch.diag(1 / norms)[:, known]
 
 
-def _orthonormal(table: Tensor, round_off: Tensor, truncation: float) -> Tensor:
-    """Orthonormal columns, in Gram-Schmidt order if they are independent, else by a truncated SVD."""
-    scale = _columns(table, round_off, truncation)
+def _orthonormal(table: Tensor, magnitude: Tensor, truncation: float) -> Tensor:
+    """Orthonormal columns, in Gram-Schmidt order if they are well conditioned, else by a truncated SVD."""
+    scale = _columns(table, magnitude, truncation)
     triangle = torch.linalg.qr(table @ scale, mode="r").R
-    _, singular, right = torch.linalg.svd(triangle, full_matrices=False)
+    extremes = torch.linalg.svdvals(triangle)[[0, -1]]
+    if triangle.shape[0] == triangle.shape[1] and extremes[1] > 1e-6 * extremes[0]:
+        signs = torch.diag(triangle.diagonal().sign())
+        return scale @ torch.linalg.solve_triangular(triangle, signs, upper=True)
+    # unscaled: functions with little to say weigh little, and weights in the original functions stay small
+    _, singular, right = torch.linalg.svd(table, full_matrices=False)
+    right = right * right.sum(dim=1, keepdim=True).sign()  # the same on every machine
     keep = singular > truncation * singular[0]
-    if int(keep.sum()) < triangle.shape[1]:
-        right = right * right.sum(dim=1, keepdim=True).sign()  # the same on every machine
-        return scale @ (right[keep].T / singular[keep])
-    signs = torch.diag(triangle.diagonal().sign())
-    return scale @ torch.linalg.solve_triangular(triangle, signs, upper=True)
+    return right[keep].T / singular[keep]
 
 
-# (table (n, L), round-off in its columns (L,), truncation) -> W (L, L') such that table @ W is conditioned
+# (table (n, L), column norms before the constraints (L,), truncation) -> W (L, L') that conditions table @ W
 CONDITIONINGS: dict[str, Callable[[Tensor, Tensor, float], Tensor]] = {
     "none": _identity,
     "columns": _columns,
@@ -62,7 +62,8 @@ class ConstrainedExpression(nn.Module):
     residual); "orthonormal" makes these derivatives orthonormal. Both drop functions that the constraints
     reduce to round-off, the second also dependent ones (singular values below `truncation`, relative), so
     L' <= L. Where the constraints leave functions whose derivative of that order is zero, the norm contains
-    the value too. Over several variables it is the norm of the functions before the constraints.
+    the value too. Over several variables it is the norm of the functions before the constraints. Constraints
+    hold to round-off in the weights of the original functions, W β.
 
     A polynomial basis should leave out what the supports span: Chebyshev(L, lowest_degree=n_constraints).
 
@@ -81,7 +82,7 @@ class ConstrainedExpression(nn.Module):
         nodes: NodeSet | None = None,
         order: int = 0,
         conditioning: str = "none",
-        truncation: float = 1e-11,
+        truncation: float = 1e-12,
         dtype: torch.dtype = torch.float64,
         device: torch.device | str = "cpu",
     ) -> None:
@@ -100,8 +101,8 @@ class ConstrainedExpression(nn.Module):
         self.register_buffer("combinations", torch.eye(basis.size, dtype=dtype, device=device))
         self.register_buffer("functionals", functionals)
         if nodes is not None:
-            table, round_off = self._table_to_condition(nodes, order)
-            self.combinations = CONDITIONINGS[conditioning](table, round_off, truncation)
+            table, magnitude = self._table_to_condition(nodes, order)
+            self.combinations = CONDITIONINGS[conditioning](table, magnitude, truncation)
             self.functionals = functionals @ self.combinations
 
     @property
@@ -114,7 +115,10 @@ class ConstrainedExpression(nn.Module):
         return len(self.constraints)
 
     def _table_to_condition(self, nodes: NodeSet, order: int) -> tuple[Tensor, Tensor]:
-        """Column norms are RMS values of derivative `order`, with the value if that derivative can vanish."""
+        """A table whose column norms are RMS values of derivative `order`, with the value if that can vanish.
+
+        With it, the norms of the columns before the constraints took their part, which carry the round-off.
+        """
         constraints = self.constraints if self.n_variables == 1 else ()
         low = functional_matrix(constraints, Chebyshev(max(order, 1)).features, max(order, 1), 1)[:, 0]
         vanishing = order > 0 and int(torch.linalg.matrix_rank(low)) < order
@@ -126,9 +130,8 @@ class ConstrainedExpression(nn.Module):
             magnitude = magnitude + switching.abs() @ functionals.abs()
         root = (nodes.weights / 2).sqrt()[:, None]
         orders = (0, order) if vanishing else (order,)
-        rows = torch.cat([root * table[e] for e in orders])
-        size = torch.cat([root * magnitude[e] for e in orders]).norm(dim=0)
-        return rows, torch.finfo(size.dtype).eps * size
+        norms = torch.cat([root * magnitude[e] for e in orders]).norm(dim=0)
+        return torch.cat([root * table[e] for e in orders]), norms
 
     def tables(self, z: Tensor, order: int) -> tuple[Tensor, Tensor]:
         """B and Ω with derivatives 0..order at z (n,).
