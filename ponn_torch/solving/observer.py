@@ -1,4 +1,4 @@
-"""What the conductor tells while it works: stages, iterations, the solution, its certificate, or a failure."""
+"""What the conductor tells while it works: stages, iterations, the solution, its certificate, a failure."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ class Observer(Protocol):
     def iteration(
         self, record: Record, blocks: Callable[[], Mapping[str, float]], cost: Callable[[], float]
     ) -> None:
-        """An iteration ended. ``blocks`` (norm per equation) and ``cost`` (user's units) are computed when called."""
+        """An iteration ended; ``blocks`` (norm per equation) and ``cost`` (user units) are computed when called."""
 
     def stage_ended(self, stage: StageResult) -> None:
         """The stage that was started last ended."""
