@@ -127,7 +127,7 @@ ACTIVATIONS: dict[str, Callable[[Tensor, int], Tensor]] = {  # (u, order) -> (or
 
 # Slopes up to these resolve smooth functions on [-1, 1] with 30 to 80 units (measured on second derivatives);
 # flatter units are nearly dependent, steeper ones leave gaps.
-DEFAULT_SLOPES: dict[str, float] = {"tanh": 6.0, "sin": 24.0, "sigmoid": 12.0, "gaussian": 10.0}
+DEFAULT_SLOPES: dict[str, float] = {"tanh": 6.0, "sin": 24.0, "sigmoid": 12.0, "gaussian": 9.0}
 
 
 def _powers(slopes: Tensor, order: int) -> Tensor:

@@ -72,7 +72,7 @@ class Constraint:
         for term in self.terms:
             words.append("-" if term.factor < 0 else "+")
             words.append(term.label if abs(term.factor) == 1 else f"{abs(term.factor):g} {term.label}")
-        return ("-" if words[0] == "-" else "") + " ".join(words[1:])
+        return ("-" if words[:1] == ["-"] else "") + " ".join(words[1:]) or "0"
 
 
 def value(variable: int, at: float, *, name: str | None = None) -> Constraint:
