@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
 import torch
@@ -23,6 +24,11 @@ class LinearBasis(nn.Module, ABC):
         if size < 1:
             raise ValueError(f"size = {size} is not a number of functions; allowed: at least 1")
         self.size = size
+
+    @property
+    def arguments(self) -> dict[str, Any]:
+        """What the class is called with, in JSON's types, to make this basis again up to its buffers."""
+        return {"size": self.size}
 
     @abstractmethod
     def features(self, z: Tensor, order: int) -> Tensor:
@@ -45,6 +51,10 @@ class _OrthogonalPolynomials(LinearBasis):
         if lowest_degree < 0:
             raise ValueError(f"lowest_degree = {lowest_degree} is not a degree; allowed: at least 0")
         self.lowest_degree = lowest_degree
+
+    @property
+    def arguments(self) -> dict[str, Any]:
+        return {"size": self.size, "lowest_degree": self.lowest_degree}
 
     def beyond(self, n_supports: int) -> LinearBasis:
         return type(self)(self.size, lowest_degree=self.lowest_degree + n_supports)
@@ -179,6 +189,10 @@ class RandomFeatures(LinearBasis):
         self.register_buffer("weight", weight.to(device=device, dtype=dtype))
         self.register_buffer("bias", bias.to(device=device, dtype=dtype))
 
+    @property
+    def arguments(self) -> dict[str, Any]:
+        return {"size": self.size, "activation": self.activation}
+
     def features(self, z: Tensor, order: int) -> Tensor:
         stack = ACTIVATIONS[self.activation](z[:, None] * self.weight + self.bias, order)
         return stack * _powers(self.weight, order)[:, None, :]
@@ -214,6 +228,10 @@ class GaussianRBF(LinearBasis):
             )
         self.register_buffer("centres", positions)
         self.register_buffer("shape", shapes.repeat(self.size) if shapes.dim() == 0 else shapes)
+
+    @property
+    def arguments(self) -> dict[str, Any]:
+        return {"centres": self.centres.tolist(), "shape": self.shape.tolist()}
 
     def features(self, z: Tensor, order: int) -> Tensor:
         slopes = self.shape.unsqueeze(-2)

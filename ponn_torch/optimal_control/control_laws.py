@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from difflib import get_close_matches
 from typing import Any, NamedTuple, Protocol
 
 import torch
@@ -81,6 +82,26 @@ class Logarithmic:
 
     def penalty(self, fraction: Tensor) -> Tensor:
         return -torch.log(fraction) - torch.log1p(-fraction)
+
+
+REGULARISERS: dict[str, Callable[[], Regulariser]] = {
+    "entropy": Entropy,
+    "quadratic": Quadratic,
+    "logarithmic": Logarithmic,
+}
+
+
+def make_regulariser(name: str) -> Regulariser:
+    """A regulariser by its name, one of REGULARISERS.
+
+    Raises:
+        ValueError: an unknown name.
+    """
+    if name not in REGULARISERS:
+        close = get_close_matches(str(name), REGULARISERS, n=1)
+        hint = f" (did you mean {close[0]!r}?)" if close else ""
+        raise ValueError(f"regulariser = {name!r}; allowed: {', '.join(REGULARISERS)}{hint}")
+    return REGULARISERS[name]()
 
 
 # -- one bounded scalar ----------------------------------------------------------------------------------------------

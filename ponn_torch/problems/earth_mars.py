@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import torch
 
-from ponn_torch.optimal_control.control_laws import Entropy, Regulariser, ThrustBall
+from ponn_torch.optimal_control.control_laws import ThrustBall, make_regulariser
 from ponn_torch.optimal_control.problem import DisplayUnit, Named, OptimalControlProblem
 from ponn_torch.problems.constants import ASTRONOMICAL_UNIT, DAY, KILOMETRE, STANDARD_GRAVITY, SUN_GM
 
@@ -25,7 +25,7 @@ def earth_mars(
     maximum_thrust: float = 0.5,
     minimum_thrust: float = 0.0,
     specific_impulse: float = 2000.0,
-    regulariser: Regulariser | None = None,
+    regulariser: str = "entropy",
     switching_level: float = 0.0,
     known_cost: float | None = OPTIMUM_KG,
 ) -> OptimalControlProblem:
@@ -46,7 +46,7 @@ def earth_mars(
         description="Earth–Mars rendezvous, fixed time, minimum fuel",
         states={"r": 3, "v": 3, "m": 1},
         control=ThrustBall(
-            "thrust", maximum_thrust, minimum_thrust, regulariser or Entropy(), switching_level, size=3
+            "thrust", maximum_thrust, minimum_thrust, make_regulariser(regulariser), switching_level, size=3
         ),
         dynamics=dynamics,
         running_cost=lambda t, x, u, p: alpha * u.thrust_magnitude,

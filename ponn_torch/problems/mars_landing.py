@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import torch
 
-from ponn_torch.optimal_control.control_laws import Entropy, Regulariser, ThrustBall
+from ponn_torch.optimal_control.control_laws import ThrustBall, make_regulariser
 from ponn_torch.optimal_control.problem import DisplayUnit, FreeTime, Named, OptimalControlProblem
 from ponn_torch.problems.constants import STANDARD_GRAVITY
 
@@ -30,7 +30,7 @@ def mars_landing(
     cant_angle_degrees: float = 27.0,
     mass_flow_per_thrust: float | None = None,
     gravity: float = 3.7114,
-    regulariser: Regulariser | None = None,
+    regulariser: str = "entropy",
     switching_level: float = 0.0,
     known_cost: float | None = OPTIMUM_KG,
 ) -> OptimalControlProblem:
@@ -53,7 +53,7 @@ def mars_landing(
         description="Mars powered descent, minimum fuel",
         states={"r": 3, "v": 3, "m": 1},
         control=ThrustBall(
-            "thrust", maximum_thrust, minimum_thrust, regulariser or Entropy(), switching_level, size=3
+            "thrust", maximum_thrust, minimum_thrust, make_regulariser(regulariser), switching_level, size=3
         ),
         dynamics=dynamics,
         running_cost=lambda t, x, u, p: alpha * u.thrust_magnitude,
