@@ -370,7 +370,9 @@ class Collocation:
         rates = self.bvp.rates(t.reshape(-1, 1), w.reshape(-1, w.shape[-1]), self.point_setting(t.shape[:-1]))
         equations = self._equations(jets, h, rates.view(w.shape))
         extra = self._extra_rows(unknowns.knots, unknowns.times, unknowns.multipliers)
-        return torch.cat([equations.flatten(-2), extra], -1)
+        rows = torch.cat([equations.flatten(-2), extra], -1)
+        # segments must keep their order: a step that turns one around is to be rejected
+        return torch.where((h > 0).all(-1, keepdim=True), rows, torch.nan) if len(self.free_time_index) else rows
 
     def linearise(self, xi: Tensor) -> tuple[Tensor, ArrowJacobian]:
         """(r, J): pointwise cotangents of F by vmapped vjp, pulled back through the tables."""

@@ -1,0 +1,107 @@
+"""Where an iteration starts: random functions, trajectories, and the projection of any curve onto an ansatz."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Protocol
+
+import torch
+from torch import Tensor
+
+from ponn_torch.ansatz.basis import Chebyshev
+from ponn_torch.optimal_control.collocation import Collocation, Discretisation, Strong, Unknowns
+from ponn_torch.optimal_control.curve import Curve
+from ponn_torch.optimal_control.pontryagin import BoundaryValueProblem
+
+ScaledCurve = Callable[[Tensor], Tensor]  # scaled times (m,) → w (m, 2n)
+
+
+def project(collocation: Collocation, curve: ScaledCurve, times: Tensor | None = None) -> Tensor:
+    """ξ (N,) whose expressions fit ``curve`` at the nodes, in least squares; known knot entries keep their values.
+
+    One call behind first guesses, warm starts, more neurons and other segments. ``times`` (K+1,) are knot times to use
+    in place of the collocation's own.
+    """
+    disc = collocation.discretisation
+    times = collocation.known_times if times is None else times
+    known = collocation.known_knots
+    # the knots of a discontinuous or extrapolated curve are read just inside the interval
+    knots = torch.where(torch.isnan(known), curve(times), known)
+    h = (times[1:] - times[:-1]) / 2
+    t = times[:-1, None] + h[:, None] * (disc.nodes.points + 1.0)
+    values = curve(t.flatten()).unflatten(0, t.shape)
+    unknowns = Unknowns(
+        weights=values.new_zeros(collocation.n_segments, disc.n_own),
+        knots=knots,
+        times=times,
+        multipliers=values.new_zeros(collocation.bvp.n_multipliers),
+    )
+    for group in disc.groups:
+        if group.trivial:
+            continue
+        kappa, _ = collocation._kappa(group, unknowns, h)
+        fitted = group.expression.fit(
+            disc.nodes.points, values[..., group.columns[:, 0]], kappa.mT, weights=disc.nodes.weights, ridge=1e-18
+        )
+        unknowns.weights[:, group.own] = fitted.mT.flatten(-2)
+    return collocation.pack(unknowns)
+
+
+class Guess(Protocol):
+    """A first curve for a boundary value problem; ``seed`` chooses among random ones."""
+
+    def curve(self, bvp: BoundaryValueProblem, seed: int) -> ScaledCurve: ...
+
+
+# -- random functions ---------------------------------------------------------------------------------------------------------
+
+DISTRIBUTIONS: dict[str, Callable[[Tensor, torch.Generator], Tensor]] = {
+    "uniform": lambda like, g: torch.rand(like.shape, generator=g, dtype=torch.float64).to(like),
+    "symmetric": lambda like, g: (2 * torch.rand(like.shape, generator=g, dtype=torch.float64) - 1).to(like),
+    "normal": lambda like, g: torch.randn(like.shape, generator=g, dtype=torch.float64).to(like),
+}
+
+
+@dataclass(frozen=True)
+class RandomGuess:
+    """Random output weights: coefficients of normalised Chebyshev polynomials in every constrained expression.
+
+    ``uniform`` is the PoNN paper's U(0, 1), whose common sign makes a strongly curved first guess; m ≡ m0 and
+    λm ≡ 1 as in the paper where ``hold_mass``. The draw does not depend on the ansatz that it is projected on.
+    """
+
+    distribution: str = "uniform"
+    scale: float = 1.0
+    n_neurons: int = 30
+    hold_mass: bool = True
+
+    def __post_init__(self) -> None:
+        if self.distribution not in DISTRIBUTIONS:
+            raise ValueError(f"distribution = {self.distribution!r}; allowed: {', '.join(DISTRIBUTIONS)}")
+
+    def curve(self, bvp: BoundaryValueProblem, seed: int) -> ScaledCurve:
+        from ponn_torch.numerics.nodes import make_nodes
+
+        like = bvp.unit
+        nodes = make_nodes("legendre_gauss", 2 * self.n_neurons, dtype=like.dtype, device=like.device)
+        disc = Discretisation(bvp, Chebyshev(self.n_neurons), nodes, Strong(), "columns")
+        collocation = Collocation.on_segments(disc, like.new_tensor([0.0, bvp.final_time]))
+        generator = torch.Generator().manual_seed(seed)
+        draw = DISTRIBUTIONS[self.distribution]
+        weights = self.scale * draw(like.new_empty(1, disc.n_own), generator)
+        knots = self.scale * draw(like.new_empty(2, bvp.dimension), generator)
+        if self.hold_mass and bvp.problem.mass is not None:
+            mass = bvp.problem.slices[bvp.problem.mass].start
+            knots[:, mass] = bvp.known_initial[mass]
+            knots[:, bvp.n_states + mass] = 1.0
+            for group in disc.groups:
+                held = (group.columns[:, 0] == mass) | (group.columns[:, 0] == bvp.n_states + mass)
+                view = weights[0, group.own].unflatten(-1, (group.n_chains, group.size))
+                view[held] = 0.0
+        known = collocation.known_knots
+        unknowns = Unknowns(
+            weights, torch.where(torch.isnan(known), knots, known), collocation.known_times, like.new_zeros(bvp.n_multipliers)
+        )
+        return Curve(collocation, collocation.pack(unknowns))
