@@ -1,0 +1,252 @@
+"""A solved trajectory in the user's units: sampled anywhere, costed, saved and loaded."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from ponn_torch.numerics.quadrature import integrate
+from ponn_torch.optimal_control.control_laws import INTERIOR, LOWER, UPPER
+from ponn_torch.optimal_control.curve import Curve
+from ponn_torch.optimal_control.pontryagin import BoundaryValueProblem, Setting
+from ponn_torch.optimal_control.problem import DisplayUnit, Named, OptimalControlProblem
+from ponn_torch.solving.storage import load_curve, save_curve
+
+ARC_LABELS = {LOWER: "min", INTERIOR: "interior", UPPER: "max"}
+TRAJECTORY = "trajectory.csv"
+
+
+@dataclass(frozen=True)
+class Samples:
+    """A trajectory at m times, in the user's units.
+
+    Attributes:
+        t: (m,) s.
+        states, costates: name → (m, size).
+        control: name → (m, size).
+        switching: S (m, n_switching), positive where more control is better; (m, 0) without bounds.
+        fraction: η ∈ [0, 1] of the admissible range, (m, k).
+        hamiltonian: (m,), the H that the solution's regime minimises, cost per s.
+        segment: (m,) index of the segment that each sample belongs to; a switch time belongs to two.
+    """
+
+    t: Tensor
+    states: dict[str, Tensor]
+    costates: dict[str, Tensor]
+    control: dict[str, Tensor]
+    switching: Tensor
+    fraction: Tensor
+    hamiltonian: Tensor
+    segment: Tensor
+
+    def __len__(self) -> int:
+        return len(self.t)
+
+
+@dataclass(frozen=True, eq=False)
+class Solution:
+    """One curve, with everything that follows from it; without a batch axis.
+
+    Raises:
+        ValueError: a batch of curves, or a control that jumps where neither a smoothing nor arcs choose it.
+    """
+
+    curve: Curve
+
+    def __post_init__(self) -> None:
+        if self.curve.xi.dim() != 1:
+            raise ValueError(f"xi has shape {tuple(self.curve.xi.shape)}; a Solution holds one curve, shape (N,)")
+        regime = self.curve.collocation.setting.regime
+        if self._jumps and regime.arcs is None and regime.smoothing is None:
+            raise ValueError(
+                f"{self.problem.name}: the optimal control jumps, but the setting has neither smoothing nor arcs"
+            )
+
+    # -- what it is ----------------------------------------------------------------------------------------------
+
+    @property
+    def bvp(self) -> BoundaryValueProblem:
+        return self.curve.collocation.bvp
+
+    @property
+    def problem(self) -> OptimalControlProblem:
+        return self.bvp.problem
+
+    @property
+    def _jumps(self) -> bool:
+        """H is affine in the control, so that it needs a smoothing or arcs."""
+        law = self.bvp.law
+        return law.n_switching > 0 and not getattr(law, "curved", False)
+
+    @property
+    def kind(self) -> str:
+        """``split`` into arcs, ``smoothed`` by a regulariser, or ``smooth`` by itself."""
+        if self.curve.collocation.setting.regime.arcs is not None:
+            return "split"
+        return "smoothed" if self._jumps else "smooth"
+
+    @property
+    def smoothing(self) -> float | None:
+        """ρ of a smoothed solution; None where no regulariser is in force."""
+        smoothing = self.curve.collocation.setting.regime.smoothing
+        return float(smoothing) if self.kind == "smoothed" and smoothing is not None else None
+
+    @property
+    def arcs(self) -> list[str]:
+        """One label per segment ("max", "min", "interior"), components joined by ","; [] if not split."""
+        codes = self.curve.collocation.setting.regime.arcs
+        if codes is None:
+            return []
+        return [",".join(ARC_LABELS[code] for code in row) for row in codes.tolist()]
+
+    @property
+    def final_time(self) -> float:
+        """s."""
+        return float(self.curve.times[-1]) * self.bvp.time_unit
+
+    @property
+    def switch_times(self) -> list[float]:
+        """Times in s at which an arc ends; fixed knots do not count."""
+        return [float(self.curve.times[k]) * self.bvp.time_unit for k in self.curve.collocation.switch_knots]
+
+    @property
+    def off_node_residual(self) -> float:
+        """Largest |ẇ − F| between the nodes, scaled."""
+        return self.curve.off_node_residual()
+
+    @property
+    def cost(self) -> float:
+        """∫ running cost dt + terminal cost, in the user's units and without the regulariser."""
+        bvp, times, total = self.bvp, self.curve.times.tolist(), 0.0
+        if self.problem.running_cost is not None:
+            for segment, (start, end) in enumerate(zip(times[:-1], times[1:], strict=True)):
+
+                def rate(t: Tensor, segment: int = segment) -> Tensor:
+                    w, setting = self._at(t, torch.full_like(t, segment, dtype=torch.long))
+                    return bvp.running_cost(t[:, None], w, setting)[:, 0]
+
+                total += integrate(rate, start, end, dtype=self.curve.xi.dtype, device=self.curve.xi.device)
+        return bvp.cost_unit * total + self._terminal_cost
+
+    @property
+    def _terminal_cost(self) -> float:
+        problem = self.problem
+        if problem.terminal_cost is None:
+            return 0.0
+        x, _ = self.bvp.to_physical(self.curve.knots[-1])
+        parameters = self.curve.setting(torch.tensor([self.curve.collocation.n_segments - 1])).parameters
+        p = Named(**{name: value[0] for name, value in parameters.items()})
+        return float(problem.terminal_cost(x.new_tensor([self.final_time]), problem.named(x), p))
+
+    # -- sampling ------------------------------------------------------------------------------------------------
+
+    def _at(self, t: Tensor, segment: Tensor) -> tuple[Tensor, Setting]:
+        """Scaled w (m, 2n) and the setting at scaled times, each on a given segment."""
+        times, w = self.curve.times, t.new_zeros(len(t), self.bvp.dimension)
+        for k in segment.unique().tolist():
+            here = segment == k
+            z = 2 * (t[here] - times[k]) / (times[k + 1] - times[k]) - 1
+            w[here] = self.curve.on_segment(z.clamp(-1.0, 1.0), k)[1]
+        return w, self.curve.setting(segment)
+
+    def _samples(self, t: Tensor, segment: Tensor) -> Samples:
+        bvp, problem = self.bvp, self.problem
+        w, setting = self._at(t, segment)
+        x, costates = bvp.to_physical(w)
+        best = bvp.minimiser(t[:, None], w, setting)
+        h = bvp.hamiltonian(t[:, None], w, setting)[:, 0] * (bvp.cost_unit / bvp.time_unit)
+        return Samples(
+            t=t * bvp.time_unit,
+            states={name: x[:, s] for name, s in problem.slices.items()},
+            costates={name: costates[:, s] for name, s in problem.slices.items()},
+            control=best.control,
+            switching=best.switching,
+            fraction=best.fraction,
+            hamiltonian=h,
+            segment=segment,
+        )
+
+    def __call__(self, t: float | Sequence[float] | NDArray[np.floating] | Tensor) -> Samples:
+        """Samples at times in s; at a switch those of the arc that begins there.
+
+        Raises:
+            ValueError: a time outside [0, final_time].
+        """
+        like = self.curve.xi
+        seconds = torch.as_tensor(t, dtype=like.dtype, device=like.device).reshape(-1)
+        slack = 1e-12 * self.final_time
+        outside = (seconds < -slack) | (seconds > self.final_time + slack) | torch.isnan(seconds)
+        if bool(outside.any()):
+            raise ValueError(f"t = {seconds[outside][0]:g} s; allowed: from 0 to final_time = {self.final_time:g} s")
+        scaled = (seconds / self.bvp.time_unit).clamp(self.curve.times[0], self.curve.times[-1])
+        return self._samples(scaled, self.curve.segment_of(scaled))
+
+    def sample(self, n: int = 400) -> Samples:
+        """n evenly spaced samples and every switch from both of its sides, in ascending time."""
+        times = self.curve.times
+        even = torch.linspace(0.0, 1.0, n, dtype=times.dtype, device=times.device)
+        even = times[0] + (times[-1] - times[0]) * even
+        even[-1] = times[-1]
+        switches = self.curve.collocation.switch_knots
+        even = even[~torch.isin(even, times[switches])]
+        t = torch.cat([even, times[switches], times[switches]])
+        before = torch.tensor(switches, dtype=torch.long, device=times.device)
+        segment = torch.cat([self.curve.segment_of(even), before - 1, before])
+        order = torch.argsort(segment.to(t.dtype) * 2 * times[-1] + t, stable=True)
+        return self._samples(t[order], segment[order])
+
+    # -- files ---------------------------------------------------------------------------------------------------
+
+    def save(self, folder: Path | str) -> None:
+        """Write solution.json, weights.npz and trajectory.csv (for people and other programs) into a folder."""
+        folder = Path(folder)
+        folder.mkdir(parents=True, exist_ok=True)
+        save_curve(self.curve, folder)
+        header, rows = self.table(self.sample())
+        with (folder / TRAJECTORY).open("w", newline="", encoding="utf-8") as stream:
+            writer = csv.writer(stream)
+            writer.writerow(header)
+            writer.writerows(rows.tolist())
+
+    @classmethod
+    def load(cls, folder: Path | str, problem: OptimalControlProblem | None = None) -> Solution:
+        """Read what ``save`` wrote; ``problem`` is needed only if the saved one has no origin.
+
+        Raises:
+            FileNotFoundError: no solution in the folder.
+            ValueError: a problem that cannot be made again, or is not the saved one.
+        """
+        return cls(load_curve(Path(folder), problem))
+
+    def table(self, samples: Samples) -> tuple[list[str], Tensor]:
+        """Column names with units, and the samples (m, columns) in the problem's display units."""
+        problem, columns = self.problem, []
+        time = problem.display.get("time", DisplayUnit("s"))
+        cost = problem.display.get("cost", DisplayUnit(""))
+
+        def add(name: str, values: Tensor, label: str, size: float) -> None:
+            numbered = [name] if values.shape[-1] == 1 else [f"{name}_{i + 1}" for i in range(values.shape[-1])]
+            for i, entry in enumerate(numbered):
+                columns.append((f"{entry} [{label}]" if label else entry, values[:, i] / size))
+
+        add("t", samples.t[:, None], time.label, time.size)
+        for name, values in samples.states.items():
+            unit = problem.display.get(name, DisplayUnit(""))
+            add(name, values, unit.label, unit.size)
+        for name, values in samples.costates.items():
+            unit = problem.display.get(name, DisplayUnit(""))
+            label = "" if unit.label in ("", cost.label) else f"{cost.label or '1'}/({unit.label})"
+            add(f"lambda_{name}", values, label, cost.size / unit.size)
+        for name, values in samples.control.items():
+            unit = problem.display.get(name, problem.display.get(name.removesuffix("_magnitude"), DisplayUnit("")))
+            add(name, values, unit.label, unit.size)
+        add("S", samples.switching, "", 1.0)
+        add("H", samples.hamiltonian[:, None], f"{cost.label or '1'}/{time.label}", cost.size / time.size)
+        return [name for name, _ in columns], torch.stack([values for _, values in columns], -1)

@@ -1,0 +1,168 @@
+"""A curve in open formats: solution.json says what it is made of, weights.npz holds its numbers."""
+
+from __future__ import annotations
+
+import importlib
+import json
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ponn_torch import __version__
+from ponn_torch.ansatz.basis import LinearBasis
+from ponn_torch.numerics.nodes import NodeSet
+from ponn_torch.optimal_control.collocation import Collocation, Discretisation, Form, Strong, Weak
+from ponn_torch.optimal_control.control_laws import Regime
+from ponn_torch.optimal_control.curve import Curve
+from ponn_torch.optimal_control.pontryagin import Chain, Setting, pontryagin
+from ponn_torch.optimal_control.problem import OptimalControlProblem, load_problem, nearest
+
+SOLUTION, WEIGHTS = "solution.json", "weights.npz"
+FORMAT = 1
+FORMS: dict[str, type[Form]] = {"Strong": Strong, "Weak": Weak}
+
+
+def save_curve(curve: Curve, folder: Path) -> None:
+    """Write solution.json and weights.npz into an existing folder."""
+    collocation = curve.collocation
+    disc, bvp, setting = collocation.discretisation, collocation.bvp, collocation.setting
+    origin = bvp.problem.origin
+    arrays: dict[str, Tensor | None] = {
+        "xi": curve.xi,
+        "known_knots": collocation.known_knots,
+        "known_times": collocation.known_times,
+        "free_times": collocation.free_times,
+        "node_points": disc.nodes.points,
+        "node_weights": disc.nodes.weights,
+        "arcs": setting.regime.arcs,
+        "smoothing": setting.regime.smoothing,
+        "check": _fingerprint(curve),
+        **{f"parameter/{name}": value for name, value in setting.parameters.items()},
+        **{f"basis/{name}": value for name, value in disc.basis.state_dict().items()},
+    }
+    description = {
+        "format": FORMAT,
+        "version": __version__,
+        "problem": {
+            "name": bvp.problem.name,
+            "reference": None if origin is None else origin.reference,
+            "arguments": None if origin is None else dict(origin.arguments),
+        },
+        "mass_variable": bvp.mass_variable,
+        "chains": [asdict(chain) for chain in bvp.chains],
+        "basis": _describe_basis(disc.basis),
+        "nodes": {"kind": disc.nodes.kind, "n_nodes": len(disc.nodes)},
+        "form": {"class": type(disc.form).__name__, "arguments": asdict(disc.form)},
+        "conditioning": disc.conditioning,
+        "knot_times": (curve.times * bvp.time_unit).tolist(),
+        "events": list(collocation.events),
+        "arcs": None if setting.regime.arcs is None else setting.regime.arcs.tolist(),
+        "smoothing": None if setting.regime.smoothing is None else float(setting.regime.smoothing),
+        "dtype": str(curve.xi.dtype).removeprefix("torch."),
+    }
+    given = {name: value.detach().cpu().numpy() for name, value in arrays.items() if value is not None}
+    with (folder / WEIGHTS).open("wb") as stream:
+        np.savez(stream, **given)
+    (folder / SOLUTION).write_text(json.dumps(description, indent=2, ensure_ascii=False) + "\n", encoding="utf-8")
+
+
+def load_curve(folder: Path, problem: OptimalControlProblem | None = None) -> Curve:
+    """Rebuild the curve on the CPU and check that it passes through the saved points.
+
+    Raises:
+        FileNotFoundError: a missing file. ValueError: another format, no problem to make it with, or another curve.
+    """
+    for name in (SOLUTION, WEIGHTS):
+        if not (folder / name).is_file():
+            raise FileNotFoundError(f"no solution in {str(folder)!r}: {str(folder / name)!r} does not exist")
+    description = json.loads((folder / SOLUTION).read_text(encoding="utf-8"))
+    if description.get("format") != FORMAT:
+        raise ValueError(f"{folder / SOLUTION}: format = {description.get('format')!r}; allowed: {FORMAT}")
+    with np.load(folder / WEIGHTS, allow_pickle=False) as stream:
+        arrays = {name: torch.from_numpy(stream[name]) for name in stream.files}
+
+    problem = problem or _make_problem(description["problem"], folder)
+    if problem.name != description["problem"]["name"]:
+        raise ValueError(
+            f"{folder / SOLUTION}: problem = {problem.name!r}; allowed: {description['problem']['name']!r}, "
+            "which was solved"
+        )
+    chains = tuple(
+        Chain(tuple(c["columns"]), tuple(c["factors"]), bool(c["trivial"])) for c in description["chains"]
+    )
+    xi = arrays["xi"]
+    bvp = pontryagin(problem, mass_variable=description["mass_variable"], chains=False, dtype=xi.dtype)
+    form = description["form"]
+    if form["class"] not in FORMS:
+        raise ValueError(f"{folder / SOLUTION}: form = {form['class']!r}; {nearest(form['class'], FORMS)}")
+    discretisation = Discretisation(
+        bvp=replace(bvp, chains=chains),
+        basis=_make_basis(description["basis"], _under("basis", arrays), xi.dtype),
+        nodes=NodeSet(description["nodes"]["kind"], arrays["node_points"], arrays["node_weights"]),
+        form=FORMS[form["class"]](**form["arguments"]),
+        conditioning=description["conditioning"],
+    )
+    collocation = Collocation(
+        discretisation=discretisation,
+        known_knots=arrays["known_knots"],
+        known_times=arrays["known_times"],
+        free_times=arrays["free_times"],
+        setting=Setting(Regime(arrays.get("smoothing"), arrays.get("arcs")), _under("parameter", arrays)),
+        events=tuple(description["events"]),
+    )
+    curve = Curve(collocation, xi)
+    _check(curve, arrays["check"], folder)
+    return curve
+
+
+# -- pieces ------------------------------------------------------------------------------------------------------------
+
+
+def _under(group: str, arrays: dict[str, Tensor]) -> dict[str, Tensor]:
+    return {name.removeprefix(f"{group}/"): value for name, value in arrays.items() if name.startswith(f"{group}/")}
+
+
+def _make_problem(saved: dict[str, Any], folder: Path) -> OptimalControlProblem:
+    if saved["reference"] is None:
+        raise ValueError(
+            f"{folder / SOLUTION}: problem {saved['name']!r} was not made by load_problem, so it cannot be made again; "
+            "pass it: Solution.load(folder, problem=...)"
+        )
+    return load_problem(saved["reference"], **saved["arguments"])
+
+
+def _describe_basis(basis: LinearBasis) -> dict[str, Any]:
+    """Class path and arguments."""
+    return {"class": f"{type(basis).__module__}:{type(basis).__qualname__}", "arguments": basis.arguments}
+
+
+def _make_basis(saved: dict[str, Any], buffers: dict[str, Tensor], dtype: torch.dtype) -> LinearBasis:
+    module, _, name = saved["class"].partition(":")
+    cls = getattr(importlib.import_module(module), name, None)
+    if not (isinstance(cls, type) and issubclass(cls, LinearBasis)):
+        raise ValueError(f"basis class = {saved['class']!r}; allowed: subclasses of LinearBasis")
+    basis = cls(**saved["arguments"]).to(dtype)
+    basis.load_state_dict(buffers)
+    return basis
+
+
+def _fingerprint(curve: Curve) -> Tensor:
+    """w at a few points of every segment (K, 5, 2n)."""
+    z = torch.linspace(-0.9, 0.8, 5, dtype=curve.xi.dtype, device=curve.xi.device)
+    return torch.stack([curve.on_segment(z, k)[1] for k in range(curve.collocation.n_segments)])
+
+
+def _check(curve: Curve, saved: Tensor, folder: Path) -> None:
+    """The basis is conditioned anew; make sure that the weights still mean the same functions."""
+    found = _fingerprint(curve)
+    limit = 1e6 * torch.finfo(saved.dtype).eps * saved.abs().amax().clamp_min(1.0)
+    error = (found - saved).abs().max() if found.shape == saved.shape else torch.tensor(torch.inf)
+    if not bool(error <= limit):
+        raise ValueError(
+            f"{folder / WEIGHTS}: the rebuilt curve misses the saved points by {float(error):.1e} (scaled); "
+            "another problem, or another release of the basis, than the one that was solved"
+        )
