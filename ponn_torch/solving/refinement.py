@@ -8,6 +8,7 @@ are tried: a solved residual with the wrong arcs is an extremal of nothing.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from enum import Enum
 
@@ -15,7 +16,7 @@ import torch
 
 from ponn_torch.ansatz.basis import Legendre, LinearBasis
 from ponn_torch.numerics.nodes import make_nodes
-from ponn_torch.optim.base import Callback, OptimizeResult, Stopping
+from ponn_torch.optim.base import Callback, OptimizeResult, Status, Stopping
 from ponn_torch.optim.least_squares import LevenbergMarquardt
 from ponn_torch.optimal_control.collocation import Collocation, Discretisation
 from ponn_torch.optimal_control.control_laws import Regime
@@ -70,8 +71,11 @@ class Split:
     linear_solver: str = "cholesky"
     basis: type[LinearBasis] = Legendre
 
-    def run(self, start: Curve, on_iteration: Callback | None = None) -> SplitResult:
-        """Refine a smoothed curve; never raises for want of convergence, the status says how it ended."""
+    def run(self, start: Curve, callback: Callable[[Collocation], Callback] | None = None) -> SplitResult:
+        """Refine a smoothed curve; never raises for want of convergence, the status says how it ended.
+
+        ``callback`` makes an iteration callback for the residual of a round.
+        """
         bvp, size, rounds = start.collocation.bvp, self.n_neurons, []
         structure = find_structure(start)
         curve, best, status = start, None, SplitStatus.STRUCTURE
@@ -80,8 +84,10 @@ class Split:
             if len(structure) > self.max_arcs:
                 status = SplitStatus.TOO_MANY_ARCS
                 break
-            curve, result = self._solve(disc, curve, structure, on_iteration)
+            curve, result = self._solve(disc, curve, structure, callback)
             rounds.append((structure, result))
+            if result.status is Status.INTERRUPTED:
+                break
             if not float(result.norm) < self.residual_tolerance:
                 status = SplitStatus.RESIDUAL
                 repaired = without_short_arcs(structure, curve.times, self.short_arc)
@@ -106,11 +112,12 @@ class Split:
         return Discretisation(bvp, self.basis(size), nodes, conditioning="orthonormal")
 
     def _solve(
-        self, disc: Discretisation, curve: Curve, structure: Structure, on_iteration: Callback | None
+        self, disc: Discretisation, curve: Curve, structure: Structure, callback: Callable[[Collocation], Callback] | None
     ) -> tuple[Curve, OptimizeResult]:
         times = torch.cat([curve.times[:1], structure.times, curve.times[-1:]])
         setting = Setting(Regime(arcs=structure.arcs), curve.collocation.setting.parameters)
         collocation = Collocation.on_segments(disc, times, events=structure.events, setting=setting)
         optimizer = LevenbergMarquardt(self.stopping, damping=self.damping, linear_solver=self.linear_solver)
+        on_iteration = callback(collocation) if callback else None
         result = optimizer.run(collocation, project(collocation, curve), on_iteration)
         return Curve(collocation, result.xi), result

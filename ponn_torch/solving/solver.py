@@ -1,0 +1,299 @@
+"""The conductor: from a problem to a certified solution in one call.
+
+start → continuation in the smoothing on a single domain (or fixed segments) → split at the switches → certificate. A start
+that fails is recognised early and the next one is tried; whatever was computed is kept and reported.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+
+import torch
+from torch import Tensor
+
+from ponn_torch.ansatz.basis import Chebyshev, LinearBasis
+from ponn_torch.numerics.nodes import make_nodes
+from ponn_torch.optim.base import Callback, NonFiniteResidual, OptimizeResult, Optimizer, Record, Status, Stopping, Stopwatch
+from ponn_torch.optim.least_squares import LevenbergMarquardt
+from ponn_torch.optimal_control.collocation import Collocation, Discretisation, Form, Strong
+from ponn_torch.optimal_control.curve import Curve
+from ponn_torch.optimal_control.pontryagin import BoundaryValueProblem, pontryagin
+from ponn_torch.optimal_control.problem import OptimalControlProblem
+from ponn_torch.solving.certificate import Certificate, Tolerances, certify
+from ponn_torch.solving.continuation import Ladder, Outcome, Schedule
+from ponn_torch.solving.guess import Guess, RandomGuess, project
+from ponn_torch.solving.observer import Observer, SilentObserver, StageResult
+from ponn_torch.solving.refinement import Split, SplitStatus
+from ponn_torch.solving.solution import Solution
+
+
+def _default_optimizer() -> Optimizer:
+    return LevenbergMarquardt(
+        Stopping(tolerance=1e-9, decrease=1e-3, max_iterations=150, hopeless=0.1, hopeless_after=60)
+    )
+
+
+@dataclass(frozen=True)
+class SolveResult:
+    """What a solve leaves: the solution and its certificate where there are, every stage, and a sentence."""
+
+    solution: Solution | None
+    certificate: Certificate | None
+    stages: list[StageResult]
+    n_starts: int
+    message: str
+    cpu_seconds: float
+    interrupted: bool = False
+
+    @property
+    def certified(self) -> bool:
+        return self.certificate is not None and self.certificate.certified
+
+
+@dataclass(frozen=True)
+class Solver:
+    """All choices of a solve; every part can be exchanged.
+
+    Attributes:
+        basis: free function of the smoothed stages (its size is the number of neurons per chain).
+        node_kind, n_nodes: collocation points per segment. form: strong or weak residual. n_segments: fixed segments.
+        optimizer, continuation, guess: of the smoothed stages. refinement: None to stop at the smoothed solution.
+        n_starts: random starts to try at most; start i of seed s uses the random stream 1000 s + i.
+        start_limit: ‖r‖ of the first stage above which a start has failed.
+        trust: a stage is kept while its off-node residual is below this fraction of the largest rate; below the
+            resolution of the nodes the residual between them gives a broken stage away.
+    """
+
+    basis: LinearBasis = field(default_factory=lambda: Chebyshev(30))
+    node_kind: str = "legendre_gauss"
+    n_nodes: int = 60
+    form: Form = field(default_factory=Strong)
+    conditioning: str = "columns"
+    n_segments: int = 1
+    optimizer: Optimizer = field(default_factory=_default_optimizer)
+    continuation: Schedule = field(default_factory=lambda: Ladder((1.0, 0.3, 0.1, 0.03, 0.01)))
+    refinement: Split | None = field(default_factory=Split)
+    guess: Guess = field(default_factory=RandomGuess)
+    n_starts: int = 10
+    start_limit: float = 0.1
+    trust: float = 0.02
+    mass_variable: str = "mass"
+    tolerances: Tolerances = field(default_factory=Tolerances)
+    dtype: torch.dtype = torch.float64
+    device: str = "cpu"
+
+    def __post_init__(self) -> None:
+        for name in ("n_nodes", "n_segments", "n_starts"):
+            value = getattr(self, name)
+            if value < 1:
+                raise ValueError(f"{name} = {value}; allowed: at least 1")
+
+    def solve(self, problem: OptimalControlProblem, seed: int = 0, observer: Observer | None = None) -> SolveResult:
+        """Solve from random starts of ``seed``; never raises for want of convergence, the message says what happened."""
+        return _Run(self, problem, seed, observer or SilentObserver()).result()
+
+    def discretisation(self, bvp: BoundaryValueProblem, form: Form | None = None) -> Discretisation:
+        like = bvp.unit
+        nodes = make_nodes(self.node_kind, self.n_nodes, dtype=like.dtype, device=like.device)
+        basis = self.basis.to(dtype=like.dtype, device=like.device)
+        return Discretisation(bvp, basis, nodes, form or self.form, self.conditioning)
+
+
+class _Interrupted(Exception):
+    """Ctrl-C reached an optimiser, which gave its best point back."""
+
+
+class _Run:
+    """One solve: holds the stages so far, so that nothing computed is lost whatever ends it."""
+
+    def __init__(self, solver: Solver, problem: OptimalControlProblem, seed: int, observer: Observer) -> None:
+        self.solver, self.problem, self.seed, self.observer = solver, problem, seed, observer
+        self.watch = Stopwatch()
+        self.bvp = pontryagin(problem, mass_variable=solver.mass_variable, dtype=solver.dtype, device=solver.device)
+        self.discretisations: dict[Form, Discretisation] = {}
+        self.stages: list[StageResult] = []
+        self.start = 0
+
+    # -- the line ------------------------------------------------------------------------------------------------------
+
+    def result(self) -> SolveResult:
+        best: Solution | None = None
+        certificate: Certificate | None = None
+        message, interrupted = "", False
+        try:
+            for self.start in range(self.solver.n_starts):
+                smoothed, message = self._continuation()
+                if smoothed is None:
+                    continue
+                candidate, note = self._refined(smoothed)
+                seconds = self.watch.seconds
+                judged = certify(candidate, self.solver.tolerances)
+                if certificate is None or judged.certified:
+                    best, certificate, message = candidate, judged, note or judged.verdict
+                if judged.certified:
+                    break
+        except _Interrupted:
+            interrupted, message = True, "interrupted; the best stage so far is kept"
+            best = best or self._best_stage()
+        else:
+            seconds = self.watch.seconds if best is None else seconds
+        if best is None:
+            best = self._best_stage()
+            message = message or "no start led to a solution"
+        if best is not None:
+            self.observer.solution(best)
+        if certificate is not None:
+            self.observer.certificate(certificate)
+        if best is None or certificate is None:
+            self.observer.failed(message)
+        seconds = self.watch.seconds if interrupted else seconds
+        return SolveResult(best, certificate, self.stages, self.start + 1, message, seconds, interrupted)
+
+    def _best_stage(self) -> Solution | None:
+        solutions = [s.solution for s in self.stages if s.solution is not None]
+        return solutions[-1] if solutions else None
+
+    # -- smoothed stages ---------------------------------------------------------------------------------------------
+
+    def _discretisation(self, form: Form | None) -> Discretisation:
+        key = form or self.solver.form
+        if key not in self.discretisations:
+            self.discretisations[key] = self.solver.discretisation(self.bvp, key)
+        return self.discretisations[key]
+
+    def _continuation(self) -> tuple[Solution | None, str]:
+        """Walk the schedule from one start; the sharpest stage that can be trusted, or None and why."""
+        solver, bvp = self.solver, self.bvp
+        like = bvp.unit
+        times = torch.linspace(0.0, 1.0, solver.n_segments + 1, dtype=like.dtype, device=like.device) * bvp.final_time
+        current = Collocation.on_segments(self._discretisation(None), times)
+        if bvp.law.n_switching:
+            current = current.with_setting(smoothing=1.0)
+        xi = project(current, solver.guess.curve(bvp, 1000 * self.seed + self.start))
+        kept: Solution | None = None
+        message = ""
+        first = True
+
+        def attempt(value: float, parameter: str, form: Form | None) -> Outcome:
+            nonlocal current, xi, kept, message, first
+            if parameter == "smoothing" and not bvp.law.n_switching:
+                trial = replace(current, discretisation=self._discretisation(form))
+            else:
+                trial = replace(current, discretisation=self._discretisation(form)).with_setting(**{parameter: value})
+            try:
+                result = self._optimise("smooth", trial, xi, solver.optimizer)
+            except NonFiniteResidual as error:
+                message = str(error)
+                return Outcome.ABORT
+            solution = self._record("smooth", Curve(trial, result.xi), result)
+            failed = not float(result.norm) < solver.start_limit
+            if first and failed:
+                message = (
+                    f"start {self.start + 1} of seed {self.seed} failed: ‖r‖ = {float(result.norm):.2g} "
+                    f"after the first stage ({result.status.value})"
+                )
+                return Outcome.ABORT
+            first = False
+            change = float((result.xi - xi).abs().max())
+            current, xi = trial, result.xi
+            if self._trusted(solution):
+                kept = solution
+            elif kept is None:
+                kept = solution
+                message = "no stage solves its own problem between the nodes; the first one is kept"
+            return Outcome.UNCHANGED if change < 1e-6 * float(xi.abs().max()) else Outcome.SOLVED
+
+        solver.continuation.run(attempt)
+        return kept, message
+
+    def _trusted(self, solution: Solution) -> bool:
+        """Whether the stage's equations hold between the nodes too (a weak form claims its moments only)."""
+        if not isinstance(solution.curve.collocation.discretisation.form, Strong):
+            return True
+        _, _, rates = solution.curve.on_segment(solution.curve.collocation.discretisation.nodes.points, 0)
+        return solution.off_node_residual <= self.solver.trust * float(rates.abs().max())
+
+    # -- refinement ---------------------------------------------------------------------------------------------------
+
+    def _refined(self, smoothed: Solution) -> tuple[Solution, str]:
+        """The split solution where it is consistent, else the smoothed one and why."""
+        split = self.solver.refinement
+        if split is None or not self.bvp.law.n_switching:
+            return smoothed, ""
+        self.observer.stage_started("split", None, len(self.stages))
+        outcome = split.run(smoothed.curve, self._callback)
+        if not outcome.rounds:
+            return smoothed, outcome.status.value
+        for _, result in outcome.rounds[:-1]:
+            self._stage("split", None, result, float("nan"), float("nan"), None)
+        _, result = outcome.rounds[-1]
+        if result.status is Status.INTERRUPTED:
+            raise _Interrupted
+        solution = self._record("split", outcome.curve, result)
+        if outcome.status is SplitStatus.CONSISTENT:
+            return solution, ""
+        return smoothed, f"split: {outcome.status.value}"
+
+    # -- bookkeeping -----------------------------------------------------------------------------------------------------
+
+    def _callback(self, collocation: Collocation) -> Callback:
+        """Translate an optimiser's iteration for the observer; norms and cost are computed only if asked for."""
+
+        def on_iteration(record: Record, xi: Tensor, residual: Tensor) -> None:
+            def blocks() -> Mapping[str, float]:
+                return {name: float(value) for name, value in collocation.blocks(residual).items()}
+
+            def cost() -> float:
+                return Solution(Curve(collocation, xi)).cost
+
+            self.observer.iteration(record, blocks, cost)
+
+        return on_iteration
+
+    def _optimise(self, name: str, collocation: Collocation, xi: Tensor, optimizer: Optimizer) -> OptimizeResult:
+        self.observer.stage_started(name, _smoothing(collocation), len(self.stages))
+        result = optimizer.run(collocation, xi, self._callback(collocation))
+        if result.status is Status.INTERRUPTED:
+            self._record(name, Curve(collocation, result.xi), result)
+            raise _Interrupted
+        return result
+
+    def _record(self, name: str, curve: Curve, result: OptimizeResult) -> Solution:
+        solution = Solution(curve)
+        self._stage(name, _smoothing(curve.collocation), result, solution.off_node_residual, solution.cost, solution)
+        return solution
+
+    def _stage(
+        self,
+        name: str,
+        smoothing: float | None,
+        result: OptimizeResult,
+        off_node_residual: float,
+        cost: float,
+        solution: Solution | None,
+    ) -> None:
+        stage = StageResult(
+            name=name,
+            smoothing=smoothing,
+            status=result.status,
+            norm=float(result.norm),
+            n_iterations=result.n_iterations,
+            n_residuals=result.n_residuals,
+            n_linearisations=result.n_linearisations,
+            cpu_seconds=result.cpu_seconds,
+            off_node_residual=off_node_residual,
+            cost=cost,
+            records=result.records,
+            start=self.start,
+            solution=solution,
+        )
+        self.stages.append(stage)
+        self.observer.stage_ended(stage)
+
+
+def _smoothing(collocation: Collocation) -> float | None:
+    value = collocation.setting.regime.smoothing
+    return None if value is None else float(value)
+
+
