@@ -78,7 +78,7 @@ class Solver:
     n_starts: int = 10
     start_limit: float = 0.1
     trust: float = 0.02
-    mass_variable: str = "mass"
+    mass_variable: str = "auto"
     tolerances: Tolerances = field(default_factory=Tolerances)
     dtype: torch.dtype = torch.float64
     device: str = "cpu"
