@@ -15,7 +15,7 @@ from torch import Tensor
 from ponn_torch.numerics.quadrature import integrate
 from ponn_torch.optimal_control.control_laws import INTERIOR, LOWER, UPPER
 from ponn_torch.optimal_control.curve import Curve
-from ponn_torch.optimal_control.pontryagin import BoundaryValueProblem, Setting
+from ponn_torch.optimal_control.pontryagin import BoundaryValueProblem, Setting, pontryagin
 from ponn_torch.optimal_control.problem import DisplayUnit, Named, OptimalControlProblem
 from ponn_torch.solving.storage import load_curve, save_curve
 
@@ -62,7 +62,9 @@ class Solution:
 
     def __post_init__(self) -> None:
         if self.curve.xi.dim() != 1:
-            raise ValueError(f"xi has shape {tuple(self.curve.xi.shape)}; a Solution holds one curve, shape (N,)")
+            raise ValueError(
+                f"xi has shape {tuple(self.curve.xi.shape)}; a Solution holds one curve, shape (N,)"
+            )
         regime = self.curve.collocation.setting.regime
         if self._jumps and regime.arcs is None and regime.smoothing is None:
             raise ValueError(
@@ -74,6 +76,14 @@ class Solution:
     @property
     def bvp(self) -> BoundaryValueProblem:
         return self.curve.collocation.bvp
+
+    @property
+    def reference(self) -> BoundaryValueProblem:
+        """The same equations in float64 on the CPU, whatever the curve was computed in."""
+        bvp = self.bvp
+        if bvp.unit.dtype == torch.float64 and bvp.unit.device.type == "cpu":
+            return bvp
+        return pontryagin(bvp.problem, mass_variable=bvp.mass_variable, chains=False)
 
     @property
     def problem(self) -> OptimalControlProblem:
@@ -129,7 +139,7 @@ class Solution:
             for segment, (start, end) in enumerate(zip(times[:-1], times[1:], strict=True)):
 
                 def rate(t: Tensor, segment: int = segment) -> Tensor:
-                    w, setting = self._at(t, torch.full_like(t, segment, dtype=torch.long))
+                    w, setting = self.at(t, torch.full_like(t, segment, dtype=torch.long))
                     return bvp.running_cost(t[:, None], w, setting)[:, 0]
 
                 total += integrate(rate, start, end, dtype=self.curve.xi.dtype, device=self.curve.xi.device)
@@ -147,7 +157,7 @@ class Solution:
 
     # -- sampling ------------------------------------------------------------------------------------------------
 
-    def _at(self, t: Tensor, segment: Tensor) -> tuple[Tensor, Setting]:
+    def at(self, t: Tensor, segment: Tensor) -> tuple[Tensor, Setting]:
         """Scaled w (m, 2n) and the setting at scaled times, each on a given segment."""
         times, w = self.curve.times, t.new_zeros(len(t), self.bvp.dimension)
         for k in segment.unique().tolist():
@@ -158,7 +168,7 @@ class Solution:
 
     def _samples(self, t: Tensor, segment: Tensor) -> Samples:
         bvp, problem = self.bvp, self.problem
-        w, setting = self._at(t, segment)
+        w, setting = self.at(t, segment)
         x, costates = bvp.to_physical(w)
         best = bvp.minimiser(t[:, None], w, setting)
         h = bvp.hamiltonian(t[:, None], w, setting)[:, 0] * (bvp.cost_unit / bvp.time_unit)
@@ -184,7 +194,9 @@ class Solution:
         slack = 1e-12 * self.final_time
         outside = (seconds < -slack) | (seconds > self.final_time + slack) | torch.isnan(seconds)
         if bool(outside.any()):
-            raise ValueError(f"t = {seconds[outside][0]:g} s; allowed: from 0 to final_time = {self.final_time:g} s")
+            raise ValueError(
+                f"t = {seconds[outside][0]:g} s; allowed: from 0 to final_time = {self.final_time:g} s"
+            )
         scaled = (seconds / self.bvp.time_unit).clamp(self.curve.times[0], self.curve.times[-1])
         return self._samples(scaled, self.curve.segment_of(scaled))
 
@@ -232,7 +244,9 @@ class Solution:
         cost = problem.display.get("cost", DisplayUnit(""))
 
         def add(name: str, values: Tensor, label: str, size: float) -> None:
-            numbered = [name] if values.shape[-1] == 1 else [f"{name}_{i + 1}" for i in range(values.shape[-1])]
+            numbered = (
+                [name] if values.shape[-1] == 1 else [f"{name}_{i + 1}" for i in range(values.shape[-1])]
+            )
             for i, entry in enumerate(numbered):
                 columns.append((f"{entry} [{label}]" if label else entry, values[:, i] / size))
 
@@ -245,7 +259,9 @@ class Solution:
             label = "" if unit.label in ("", cost.label) else f"{cost.label or '1'}/({unit.label})"
             add(f"lambda_{name}", values, label, cost.size / unit.size)
         for name, values in samples.control.items():
-            unit = problem.display.get(name, problem.display.get(name.removesuffix("_magnitude"), DisplayUnit("")))
+            unit = problem.display.get(
+                name, problem.display.get(name.removesuffix("_magnitude"), DisplayUnit(""))
+            )
             add(name, values, unit.label, unit.size)
         add("S", samples.switching, "", 1.0)
         add("H", samples.hamiltonian[:, None], f"{cost.label or '1'}/{time.label}", cost.size / time.size)

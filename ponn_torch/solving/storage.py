@@ -67,7 +67,9 @@ def save_curve(curve: Curve, folder: Path) -> None:
     given = {name: value.detach().cpu().numpy() for name, value in arrays.items() if value is not None}
     with (folder / WEIGHTS).open("wb") as stream:
         np.savez(stream, **given)
-    (folder / SOLUTION).write_text(json.dumps(description, indent=2, ensure_ascii=False) + "\n", encoding="utf-8")
+    (folder / SOLUTION).write_text(
+        json.dumps(description, indent=2, ensure_ascii=False) + "\n", encoding="utf-8"
+    )
 
 
 def load_curve(folder: Path, problem: OptimalControlProblem | None = None) -> Curve:
@@ -123,7 +125,11 @@ def load_curve(folder: Path, problem: OptimalControlProblem | None = None) -> Cu
 
 
 def _under(group: str, arrays: dict[str, Tensor]) -> dict[str, Tensor]:
-    return {name.removeprefix(f"{group}/"): value for name, value in arrays.items() if name.startswith(f"{group}/")}
+    return {
+        name.removeprefix(f"{group}/"): value
+        for name, value in arrays.items()
+        if name.startswith(f"{group}/")
+    }
 
 
 def _make_problem(saved: dict[str, Any], folder: Path) -> OptimalControlProblem:
