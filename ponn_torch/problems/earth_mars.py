@@ -9,9 +9,10 @@ import torch
 from ponn_torch.optimal_control.control_laws import ThrustBall, make_regulariser
 from ponn_torch.optimal_control.problem import DisplayUnit, Named, OptimalControlProblem
 from ponn_torch.problems.constants import ASTRONOMICAL_UNIT, DAY, KILOMETRE, STANDARD_GRAVITY, SUN_GM
+from ponn_torch.problems.known import known_optimum
 
 TIME_UNIT = 58.132 * DAY
-OPTIMUM_KG = 396.05984393
+OPTIMA_KG: list[tuple[dict[str, object], float]] = [({}, 396.05984393)]
 
 
 def earth_mars(
@@ -27,9 +28,15 @@ def earth_mars(
     specific_impulse: float = 2000.0,
     regulariser: str = "entropy",
     switching_level: float = 0.0,
-    known_cost: float | None = OPTIMUM_KG,
+    known_cost: float | None = None,
+    name: str = "earth_mars",
 ) -> OptimalControlProblem:
-    """Heliocentric two-body transfer minimising fuel; thrust in N, Isp in s, mass in kg."""
+    """Heliocentric two-body transfer minimising fuel; thrust in N, Isp in s, mass in kg.
+
+    ``known_cost`` None takes the known optimum where the data are the published ones.
+    """
+    if known_cost is None:
+        known_cost = known_optimum(earth_mars, locals(), OPTIMA_KG)
     alpha = 1.0 / (specific_impulse * STANDARD_GRAVITY)  # kg per N s
     speed_unit = ASTRONOMICAL_UNIT / TIME_UNIT
 
@@ -42,7 +49,7 @@ def earth_mars(
         }
 
     return OptimalControlProblem(
-        name="earth_mars",
+        name=name,
         description="Earth–Mars rendezvous, fixed time, minimum fuel",
         states={"r": 3, "v": 3, "m": 1},
         control=ThrustBall(

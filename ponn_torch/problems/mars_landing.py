@@ -10,8 +10,18 @@ import torch
 from ponn_torch.optimal_control.control_laws import ThrustBall, make_regulariser
 from ponn_torch.optimal_control.problem import DisplayUnit, FreeTime, Named, OptimalControlProblem
 from ponn_torch.problems.constants import STANDARD_GRAVITY
+from ponn_torch.problems.known import known_optimum
 
-OPTIMUM_KG = 268.0146563274
+_TFC: dict[str, object] = {"mass_flow_per_thrust": 5.0863e-4, "free_final_time": True}
+OPTIMA_KG: list[tuple[dict[str, object], float]] = [
+    ({}, 268.0146563274),
+    ({"standard_gravity": 9.81}, 267.9318584923),
+    (
+        {"initial_position": (-900.0, 100.0, 1500.0), "initial_velocity": (30.0, -10.0, -70.0), **_TFC},
+        179.4476468458,
+    ),
+    ({"initial_velocity": (85.0, 50.0, -65.0), **_TFC}, 275.2062387119),
+]
 
 
 def mars_landing(
@@ -32,13 +42,19 @@ def mars_landing(
     gravity: float = 3.7114,
     regulariser: str = "entropy",
     switching_level: float = 0.0,
-    known_cost: float | None = OPTIMUM_KG,
+    known_cost: float | None = None,
+    name: str = "mars_landing",
 ) -> OptimalControlProblem:
     """Pinpoint landing in constant gravity, SI; altitude is not constrained.
 
     The engines are canted, so the mass flow is α|T| with α = 1/(Isp g0 cos φ); ``mass_flow_per_thrust`` (kg per N s)
-    overrides it, as in the TFC paper's rounded 5.0863e-4.
+    overrides it, as in the TFC paper's rounded 5.0863e-4. ``known_cost`` None takes the known optimum where the
+    data are published ones.
     """
+    if known_cost is None:
+        unused = ["final_time"] if free_final_time else []
+        unused += ["specific_impulse", "standard_gravity", "cant_angle_degrees"] if mass_flow_per_thrust else []
+        known_cost = known_optimum(mars_landing, locals(), OPTIMA_KG, unused)
     cosine = math.cos(math.radians(cant_angle_degrees))
     alpha = mass_flow_per_thrust or 1.0 / (specific_impulse * standard_gravity * cosine)
     length = max(math.hypot(*initial_position), 1.0)
@@ -49,7 +65,7 @@ def mars_landing(
         return {"r": x.v, "v": down + u.thrust / x.m, "m": -alpha * u.thrust_magnitude}
 
     return OptimalControlProblem(
-        name="mars_landing",
+        name=name,
         description="Mars powered descent, minimum fuel",
         states={"r": 3, "v": 3, "m": 1},
         control=ThrustBall(
