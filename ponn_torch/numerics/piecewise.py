@@ -1,4 +1,4 @@
-"""A vector function of time as piecewise Chebyshev interpolants, refined by halving until it is met to round-off."""
+"""A vector function of time as Chebyshev interpolants, on panels halved until round-off is met."""
 
 from __future__ import annotations
 
@@ -39,9 +39,10 @@ def approximate(
     n_levels: int = 30,
     most_panels: int = 4096,
 ) -> PiecewiseChebyshev:
-    """Interpolate f (m,) → (m, k), called once per level, on panels halved until ``tolerance`` of each |f_k| is met.
+    """Interpolate f (m,) → (m, k), called once per level of halving.
 
-    A jump is enclosed by panels 2^-n_levels as long as the first.
+    ``tolerance`` is relative to the largest |f_k| of each component. A jump is enclosed by panels 2^-n_levels
+    as long as the first.
     """
     angles = np.pi * np.arange(2 * degree + 1) / (2 * degree)
     z = -np.cos(angles)  # every other point is a node, those between are tests

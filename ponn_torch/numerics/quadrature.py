@@ -24,8 +24,8 @@ def integrate(
 ) -> float:
     """∫ f dt over [start, end] for f (m,) → (m,), called once per level of halving.
 
-    A panel is accepted when Gauss–Legendre on it and on its halves agree to ``tolerance`` of the whole; thin layers
-    and jumps are thereby resolved down to 2^-n_levels of a panel.
+    A panel is accepted when Gauss–Legendre on it and on its halves agree to ``tolerance`` of the whole; thin
+    layers and jumps are thereby resolved down to 2^-n_levels of a panel.
     """
     rule = make_nodes("legendre_gauss", n_nodes, dtype=dtype, device=device)
     edges = torch.linspace(start, end, n_panels + 1, dtype=dtype, device=device)

@@ -1,7 +1,7 @@
 """Trace a function of small tensors once into a short list of operations, free of the overhead of torch.func.
 
-A pointwise right-hand side with derivatives by torch.func costs a millisecond a call, nearly all of it Python; an
-integrator calls it thousands of times at one point.
+A pointwise right-hand side with derivatives by torch.func costs a millisecond a call, nearly all of it
+Python; an integrator calls it thousands of times at one point.
 """
 
 from __future__ import annotations
@@ -13,24 +13,14 @@ import torch
 from torch import Tensor, fx
 
 Function = Callable[..., Tensor]
-_FILLERS = (
-    "zeros_like",
-    "ones_like",
-    "full_like",
-    "new_zeros",
-    "new_ones",
-    "new_full",
-    "zeros",
-    "ones",
-    "full",
-)
+_FILLERS = ("zeros", "ones", "full", "new_zeros", "new_ones", "new_full", "scalar_tensor")
 
 
 def trace(function: Function, *examples: Tensor) -> Function:
     """The same function as a graph, for arguments of the examples' shapes.
 
-    Where tracing fails (control flow that depends on data), the operations change tensors in place, or the graph gives
-    other values near the examples, the function itself comes back.
+    The function itself comes back where tracing fails (control flow that depends on data), where operations
+    change tensors in place, and where the graph gives other values near the examples.
     """
     try:
         from torch.fx.experimental.proxy_tensor import make_fx
@@ -42,7 +32,8 @@ def trace(function: Function, *examples: Tensor) -> Function:
         ):
             return function
         graph = _fold(graph, examples)
-        graph = CSEPass()(graph).graph_module
+        shared = CSEPass()(graph)
+        graph = graph if shared is None else shared.graph_module
         graph.graph.eliminate_dead_code()
         graph.recompile()
         elsewhere = [x * 1.01 if x.is_floating_point() else x for x in examples]
@@ -73,10 +64,11 @@ class _Recorder(fx.Interpreter):
 
 
 def _fold(module: fx.GraphModule, examples: tuple[Tensor, ...]) -> fx.GraphModule:
-    """Replace what does not depend on the arguments by constants, one per value, and drop expansions to the same shape."""
+    """Make constants of what does not depend on the arguments, one per value, and drop idle views."""
     recorder = _Recorder(module)
     recorder.run(*examples)
-    values, constant, known = recorder.values, set(), {}
+    values, constant = recorder.values, set()
+    known: dict[tuple, fx.Node] = {}
     for node in list(module.graph.nodes):
         if node.op == "get_attr":
             constant.add(node)

@@ -1,9 +1,10 @@
-"""A solution flown by an integrator that knows nothing of its basis: DOP853 from the found start, restarted at switches."""
+"""A solution flown by DOP853, which knows nothing of its basis; restarted exactly at the switches."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 import torch
@@ -50,13 +51,13 @@ def fly(
     *,
     most_steps: int = 20000,
 ) -> Flight:
-    """Integrate over the segments between ``knots``; a step enters a panel of ``resolution`` by its length at most.
+    """Integrate over the segments between ``knots``, entering a panel of ``resolution`` by its length.
 
     The panels resolve the control, so that no thin layer of a smoothed switch lies between two stages unseen.
     """
     times, values, segments, y = [], [], [], start
     n_evaluations, message = 0, ""
-    for segment, (begin, end) in enumerate(zip(knots[:-1], knots[1:], strict=True)):
+    for segment, (begin, end) in enumerate(pairwise(knots)):
         edges = np.asarray(resolution[segment].edges)
         lengths = np.diff(edges)
 
@@ -90,7 +91,8 @@ def fly(
                 segments.append(segment)
         n_evaluations += solver.nfev
         if solver.status != "finished":
-            message = f"the flight ended at {solver.t / knots[-1]:.3f} of the final time: {message or 'too many steps'}"
+            reason = message or "the states are not finite, or too many steps"
+            message = f"the flight ended at {solver.t / knots[-1]:.3f} of the final time: {reason}"
             break
         y = solver.y
     return Flight(
@@ -103,11 +105,11 @@ def fly(
     )
 
 
-# -- what is flown -----------------------------------------------------------------------------------------------------
+# -- what is flown -------------------------------------------------------------------------------------------
 
 
 def control_history(solution: Solution) -> list[PiecewiseChebyshev]:
-    """The solution's control, all names side by side in the user's units, per segment and in scaled time."""
+    """The solution's control over scaled time, per segment; all names side by side, in the user's units."""
     curve = solution.curve
     knots = curve.times.tolist()
 
@@ -151,7 +153,7 @@ def _point_setting(solution: Solution, smoothing: Tensor | None, arcs: Tensor | 
 
 
 def fly_extremal(solution: Solution, history: list[PiecewiseChebyshev], *, explicit_time: bool) -> Flight:
-    """States and costates from the found start under the law of the regime; y = (w, ∫L dt, ∫∂H/∂t dt)."""
+    """States and costates from the found start under the regime's law; y = (w, ∫L dt, ∫∂H/∂t dt)."""
     bvp, given = solution.reference, solution.curve.collocation.setting.regime
     smoothing = (
         torch.zeros(1, dtype=torch.float64) if given.smoothing is None else given.smoothing.double().cpu()
@@ -179,7 +181,7 @@ def fly_extremal(solution: Solution, history: list[PiecewiseChebyshev], *, expli
 
 
 def fly_control(solution: Solution, history: list[PiecewiseChebyshev]) -> Flight:
-    """States alone from the given start under the control as a function of time; y = (x/unit, ∫L dt), scaled time."""
+    """States alone from the given start under the control as a function of time; y = (x/unit, ∫L dt)."""
     bvp, problem = solution.reference, solution.problem
     x0, _ = bvp.to_physical(solution.curve.knots[0].detach().double().cpu())
     known = problem.boundary("initial")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -68,10 +69,10 @@ class Solution:
         regime = self.curve.collocation.setting.regime
         if self._jumps and regime.arcs is None and regime.smoothing is None:
             raise ValueError(
-                f"{self.problem.name}: the optimal control jumps, but the setting has neither smoothing nor arcs"
+                f"{self.problem.name}: its optimal control jumps, so the setting needs a smoothing or arcs"
             )
 
-    # -- what it is ----------------------------------------------------------------------------------------------
+    # -- what it is ------------------------------------------------------------------------------------------
 
     @property
     def bvp(self) -> BoundaryValueProblem:
@@ -136,7 +137,7 @@ class Solution:
         """∫ running cost dt + terminal cost, in the user's units and without the regulariser."""
         bvp, times, total = self.bvp, self.curve.times.tolist(), 0.0
         if self.problem.running_cost is not None:
-            for segment, (start, end) in enumerate(zip(times[:-1], times[1:], strict=True)):
+            for segment, (start, end) in enumerate(pairwise(times)):
 
                 def rate(t: Tensor, segment: int = segment) -> Tensor:
                     w, setting = self.at(t, torch.full_like(t, segment, dtype=torch.long))
@@ -151,11 +152,13 @@ class Solution:
         if problem.terminal_cost is None:
             return 0.0
         x, _ = self.bvp.to_physical(self.curve.knots[-1])
-        parameters = self.curve.setting(torch.tensor([self.curve.collocation.n_segments - 1])).parameters
+        parameters = self.curve.setting(
+            torch.tensor([self.curve.collocation.n_segments - 1], device=x.device)
+        ).parameters
         p = Named(**{name: value[0] for name, value in parameters.items()})
         return float(problem.terminal_cost(x.new_tensor([self.final_time]), problem.named(x), p))
 
-    # -- sampling ------------------------------------------------------------------------------------------------
+    # -- sampling --------------------------------------------------------------------------------------------
 
     def at(self, t: Tensor, segment: Tensor) -> tuple[Tensor, Setting]:
         """Scaled w (m, 2n) and the setting at scaled times, each on a given segment."""
@@ -214,10 +217,10 @@ class Solution:
         order = torch.argsort(segment.to(t.dtype) * 2 * times[-1] + t, stable=True)
         return self._samples(t[order], segment[order])
 
-    # -- files ---------------------------------------------------------------------------------------------------
+    # -- files -----------------------------------------------------------------------------------------------
 
     def save(self, folder: Path | str) -> None:
-        """Write solution.json, weights.npz and trajectory.csv (for people and other programs) into a folder."""
+        """Write solution.json, weights.npz and trajectory.csv (for other programs) into a folder."""
         folder = Path(folder)
         folder.mkdir(parents=True, exist_ok=True)
         save_curve(self.curve, folder)

@@ -66,7 +66,7 @@ def save_curve(curve: Curve, folder: Path) -> None:
     }
     given = {name: value.detach().cpu().numpy() for name, value in arrays.items() if value is not None}
     with (folder / WEIGHTS).open("wb") as stream:
-        np.savez(stream, **given)
+        np.savez(stream, **given)  # type: ignore[arg-type]
     (folder / SOLUTION).write_text(
         json.dumps(description, indent=2, ensure_ascii=False) + "\n", encoding="utf-8"
     )
@@ -76,7 +76,8 @@ def load_curve(folder: Path, problem: OptimalControlProblem | None = None) -> Cu
     """Rebuild the curve on the CPU and check that it passes through the saved points.
 
     Raises:
-        FileNotFoundError: a missing file. ValueError: another format, no problem to make it with, or another curve.
+        FileNotFoundError: a missing file.
+        ValueError: another format, no problem to make it with, or another curve.
     """
     for name in (SOLUTION, WEIGHTS):
         if not (folder / name).is_file():
@@ -121,7 +122,7 @@ def load_curve(folder: Path, problem: OptimalControlProblem | None = None) -> Cu
     return curve
 
 
-# -- pieces ------------------------------------------------------------------------------------------------------------
+# -- pieces --------------------------------------------------------------------------------------------------
 
 
 def _under(group: str, arrays: dict[str, Tensor]) -> dict[str, Tensor]:
@@ -135,8 +136,8 @@ def _under(group: str, arrays: dict[str, Tensor]) -> dict[str, Tensor]:
 def _make_problem(saved: dict[str, Any], folder: Path) -> OptimalControlProblem:
     if saved["reference"] is None:
         raise ValueError(
-            f"{folder / SOLUTION}: problem {saved['name']!r} was not made by load_problem, so it cannot be made again; "
-            "pass it: Solution.load(folder, problem=...)"
+            f"{folder / SOLUTION}: problem {saved['name']!r} was not made by load_problem and cannot be "
+            "made again; pass it: Solution.load(folder, problem=...)"
         )
     return load_problem(saved["reference"], **saved["arguments"])
 

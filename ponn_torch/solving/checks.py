@@ -1,0 +1,185 @@
+"""What a certificate measures: a flight, or the curve, against one condition of the principle each."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.func import grad
+
+from ponn_torch.optimal_control.control_laws import INTERIOR, UPPER, Regime
+from ponn_torch.optimal_control.pontryagin import Setting
+from ponn_torch.optimal_control.problem import Named
+from ponn_torch.solving.flight import Flight
+from ponn_torch.solving.solution import Solution
+
+
+def _last(solution: Solution, flight: Flight) -> tuple[Tensor, Tensor, Setting]:
+    """(t (1, 1), y (1, ·), setting) at the end of a flight; NaN if it did not arrive."""
+    y = torch.from_numpy(flight.y[-1:].copy())
+    if not flight.arrived:
+        y = torch.full_like(y, torch.nan)
+    return torch.tensor([[flight.t[-1]]]), y, _settings(solution, flight.segment[-1:])
+
+
+def _settings(solution: Solution, segment: np.ndarray) -> Setting:
+    """The curve's setting at points of the given segments, in float64 on the CPU."""
+    setting = solution.curve.setting(torch.as_tensor(segment, device=solution.curve.xi.device))
+    smoothing, arcs = setting.regime.smoothing, setting.regime.arcs
+    return Setting(
+        Regime(None if smoothing is None else smoothing.double().cpu(), None if arcs is None else arcs.cpu()),
+        {name: value.double().cpu() for name, value in setting.parameters.items()},
+    )
+
+
+def _worst(errors: Tensor) -> float:
+    """Largest |error|, infinite where one is not a number; 0 of none."""
+    return float(torch.nan_to_num(errors.abs(), nan=math.inf).max()) if errors.numel() else 0.0
+
+
+def _by_state(solution: Solution, x: Tensor) -> dict[str, float]:
+    """Norm of x − final per state with a known end, in user units."""
+    errors = {}
+    known = solution.problem.boundary("final")
+    for name, where in solution.problem.slices.items():
+        pairs = [(float(a), b) for a, b in zip(x[where], known[where], strict=True) if b is not None]
+        if pairs:
+            norm = math.sqrt(sum((a - b) ** 2 for a, b in pairs))
+            errors[name] = math.inf if math.isnan(norm) else norm
+    return errors
+
+
+def end_errors(solution: Solution, flight: Flight) -> tuple[float, dict[str, float]]:
+    """Boundary conditions of the flown extremal: worst scaled component, final norms per state."""
+    bvp, n = solution.reference, solution.bvp.n_states
+    w = _last(solution, flight)[1][0, : bvp.dimension]
+    start = torch.from_numpy(flight.y[0, : bvp.dimension].copy())
+    misses = []
+    for value, known in ((start, bvp.known_initial), (w[:n], bvp.known_final[:n])):
+        given = ~torch.isnan(known)
+        misses.append((value - known)[given])
+    return _worst(torch.cat(misses)), _by_state(solution, bvp.to_physical(w)[0])
+
+
+def control_end_errors(solution: Solution, flight: Flight) -> tuple[float, dict[str, float]]:
+    """Final conditions of the control flown alone: worst scaled component, norms per state."""
+    bvp = solution.reference
+    x = bvp.unit * _last(solution, flight)[1][0, : bvp.n_states]
+    known = x.new_tensor([math.nan if v is None else v for v in solution.problem.boundary("final")])
+    given = ~torch.isnan(known)
+    return _worst(((x - known) / bvp.unit)[given]), _by_state(solution, x)
+
+
+def terminal(solution: Solution, flight: Flight) -> tuple[float, float, float | None]:
+    """(transversality, manifold, free time) at the end of the flown extremal, scaled."""
+    bvp, n = solution.reference, solution.bvp.n_states
+    if not flight.arrived:
+        return math.inf, math.inf, math.inf if solution.problem.free_final_time else None
+    t, y, setting = _last(solution, flight)
+    w = y[:, : bvp.dimension]
+    known = bvp.known_final[n:]
+    costates = (w[0, n:] - known)[~torch.isnan(known)]
+    multipliers = solution.curve.unknowns.multipliers.double().cpu()[None]
+    rows = bvp.terminal_rows(t, w, multipliers, setting)[0]
+    n_costates = len(bvp.terminal_components)
+    n_manifold = n_costates + bvp.n_multipliers
+    free_time = _worst(rows[n_manifold:]) if solution.problem.free_final_time else None
+    return _worst(torch.cat([costates, rows[:n_costates]])), _worst(rows[n_costates:n_manifold]), free_time
+
+
+def flown_cost(solution: Solution, flight: Flight) -> float:
+    """Cost of the control flown alone, user units; NaN if it did not arrive."""
+    bvp, problem = solution.reference, solution.problem
+    t, y, setting = _last(solution, flight)
+    cost = bvp.cost_unit * float(y[0, -1])
+    if problem.terminal_cost is not None:
+        state = problem.named(bvp.unit * y[:, : bvp.n_states])
+        cost += float(problem.terminal_cost(t * bvp.time_unit, state, Named(**setting.parameters)))
+    return cost
+
+
+def _time_slope(solution: Solution, t: Tensor, w: Tensor, setting: Setting) -> Tensor:
+    return grad(lambda time: solution.reference.hamiltonian(time, w, setting).sum())(t)
+
+
+def depends_on_time(solution: Solution) -> bool:
+    """H depends on time apart from the states: ∂H/∂t is not zero somewhere along the curve."""
+    curve = solution.curve
+    t = torch.linspace(float(curve.times[0]), float(curve.times[-1]), 33).to(curve.xi)
+    segment = curve.segment_of(t)
+    w, _ = solution.at(t, segment)
+    setting = _settings(solution, segment.cpu().numpy())
+    return bool((_time_slope(solution, t.double().cpu()[:, None], w.double().cpu(), setting) != 0).any())
+
+
+def hamiltonian_drift(solution: Solution, flight: Flight, explicit_time: bool) -> float:
+    """(max − min of H − ∫∂H/∂t) / max Σ|terms of H| along the flown extremal."""
+    bvp, n = solution.reference, solution.bvp.n_states
+    y = torch.from_numpy(flight.y)
+    t, w = torch.from_numpy(flight.t)[:, None], y[:, : bvp.dimension]
+    setting = _settings(solution, flight.segment)
+    h = bvp.hamiltonian(t, w, setting)
+    power = bvp.conjugate * w[:, n:] * bvp.rates(t, w, setting)[:, :n] / bvp.cost_unit
+    cost = bvp.running_cost(t, w, setting)
+    penalty = h - power.sum(-1, keepdim=True) - cost
+    terms = power.abs().sum(-1, keepdim=True) + cost.abs() + penalty.abs()
+    if explicit_time:
+        h = h - y[:, -1:]
+    drift = float((h.max() - h.min()) / terms.max())
+    return drift if math.isfinite(drift) else math.inf
+
+
+# -- signs of the switching functions ------------------------------------------------------------------------
+
+
+def _depth(switching: Tensor, codes: Tensor) -> Tensor:
+    """Distance (m, k) of S from the side that the codes claim, negative where it is on it.
+
+    A convex H has one S at each bound: the control is off the lower bound where the first is positive, and at
+    the upper where the second is.
+    """
+    levels = (UPPER,) if switching.shape[-1] == codes.shape[-1] else (INTERIOR, UPPER)
+    parts = switching.chunk(len(levels), -1)
+    signed = [torch.where(codes >= level, -s, s) for level, s in zip(levels, parts, strict=True)]
+    return torch.stack(signed).amax(0)
+
+
+def signs(solution: Solution, tolerance: float, n_points: int = 401) -> tuple[float | None, float | None]:
+    """(deepest S on the wrong side, largest share of an arc with S = 0), refined at ends and peaks."""
+    curve = solution.curve
+    arcs = curve.collocation.setting.regime.arcs
+    if arcs is None:
+        return None, None
+    options: dict[str, Any] = {"dtype": curve.xi.dtype, "device": curve.xi.device}
+    even = torch.linspace(-1.0, 1.0, n_points, **options)
+    near = torch.logspace(-9, -2.3, 40, **options)
+    fractions = torch.linspace(0.0, 1.0, 41, **options)
+    affine = solution.bvp.law.n_switching == arcs.shape[-1]
+    grid = torch.cat([even, near - 1.0, 1.0 - near]).sort().values
+    deepest, share = 0.0, 0.0
+    for k in range(curve.collocation.n_segments):
+
+        def depth(z: Tensor, k: int = k) -> tuple[Tensor, Tensor]:
+            t, w, _ = curve.on_segment(z, k)
+            setting = curve.setting(torch.full((len(z),), k, device=z.device))
+            switching = solution.bvp.switching(t[:, None], w, setting)
+            return _depth(switching, arcs[k]), switching
+
+        z = grid
+        for _ in range(3):
+            here, _ = depth(z)
+            deepest = max(deepest, _worst(here.clamp_min(0.0)))
+            # a local maximum between grid points may reach further: look there again, closer
+            rise = (here[1:-1] >= here[:-2]) & (here[1:-1] >= here[2:])
+            peaks = rise.any(-1).nonzero()[:, 0] + 1
+            if not len(peaks) or len(peaks) > 50:
+                break
+            left, right = z[peaks - 1], z[peaks + 1]
+            z = (left[:, None] + (right - left)[:, None] * fractions).flatten().unique()
+        if affine:  # an arc with S = 0, or inside the bounds, is singular
+            zero = (depth(even[1:-1])[1].abs() <= tolerance).double().mean(0)
+            share = max(share, float(torch.where(arcs[k] == INTERIOR, 1.0, zero).max()))
+    return deepest, share
