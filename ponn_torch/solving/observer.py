@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
 from ponn_torch.optim.base import Record, Status
 
@@ -42,7 +42,7 @@ class StageResult:
     solution: Solution | None = field(default=None, repr=False)
 
 
-class Observer(Protocol):
+class Observer:
     """Called by the conductor; inherit from it to override what matters, the rest does nothing."""
 
     def stage_started(self, name: str, smoothing: float | None, index: int) -> None:
@@ -51,7 +51,7 @@ class Observer(Protocol):
     def iteration(
         self, record: Record, blocks: Callable[[], Mapping[str, float]], cost: Callable[[], float]
     ) -> None:
-        """An iteration ended; ``blocks`` (norm per equation) and ``cost`` (user units) are computed when called."""
+        """An iteration ended; ``blocks`` (norm per equation) and ``cost`` (user units) run when called."""
 
     def stage_ended(self, stage: StageResult) -> None:
         """The stage that was started last ended."""

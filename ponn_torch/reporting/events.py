@@ -1,0 +1,145 @@
+"""TensorBoard event files with one set of tags for every optimiser, hyperparameters in the same run."""
+
+from __future__ import annotations
+
+import io
+import math
+import time
+from collections import deque
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+from tensorboard.compat.proto.summary_pb2 import Summary  # type: ignore[import-untyped]
+from torch.utils.tensorboard import SummaryWriter
+from torch.utils.tensorboard.summary import hparams
+
+from ponn_torch.optim.base import Record
+from ponn_torch.reporting.figures import stage_figure
+from ponn_torch.reporting.recorder import Recorder
+from ponn_torch.solving.certificate import Certificate
+from ponn_torch.solving.observer import StageResult
+from ponn_torch.solving.solution import Solution
+
+# Written at every iteration; NaN where an optimiser has no such thing, so that runs share their charts.
+OPTIM_TAGS = ("damping", "step", "accepted", "running", "residuals", "linearisations")
+METRICS = ("certificate/certified", "certificate/end_error_scaled", "certificate/cost", "time/seconds")
+MAX_FIGURES = 30  # TensorBoard crawls under hundreds
+
+
+def flatten(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Nested mappings as one level with dotted names."""
+    flat: dict[str, Any] = {}
+    for name, value in values.items():
+        if isinstance(value, Mapping):
+            flat |= flatten(value, f"{prefix}{name}.")
+        else:
+            flat[f"{prefix}{name}"] = value
+    return flat
+
+
+def _hyperparameters(settings: Mapping[str, Any]) -> dict[str, float | int | str]:
+    """Numbers as they are, everything else as text: what the HPARAMS tab can hold."""
+    return {
+        name: value if isinstance(value, int | float) and not isinstance(value, bool) else str(value)
+        for name, value in flatten(settings).items()
+        if value is not None
+    }
+
+
+def _numbers(values: Mapping[str, Any]) -> dict[str, float]:
+    return {
+        name.replace(".", "/"): float(value)
+        for name, value in flatten(values).items()
+        if isinstance(value, bool | int | float)
+    }
+
+
+class TensorBoard(Recorder):
+    """residual/total, residual/<equation>, optim/*, stage/*, cost/<cost_name>, certificate/*, time/seconds.
+
+    All scalars of an iteration are one event, which costs a tenth of a call per scalar. Hyperparameters go
+    into the same writer, so that no second run appears beside this one.
+    """
+
+    def __init__(
+        self, folder: Path, *, settings: Mapping[str, Any], cost_name: str = "cost", figures: bool = True
+    ) -> None:
+        self._writer = SummaryWriter(str(folder), flush_secs=10)
+        self._step, self._stage, self._start = 0, -1, time.perf_counter()
+        self._cost_tag, self._failed = f"cost/{cost_name}", False
+        self._figures: deque[tuple[int, Solution]] = deque(maxlen=MAX_FIGURES if figures else 0)
+        experiment, begin, self._end = hparams(_hyperparameters(settings), dict.fromkeys(METRICS, 0.0))
+        for summary in (experiment, begin):
+            self._add(summary, 0)
+
+    def _add(self, summary: Summary, step: int) -> None:
+        self._writer._get_file_writer().add_summary(summary, step)
+
+    def _scalars(self, values: Mapping[str, float], step: int) -> None:
+        entries = [Summary.Value(tag=tag, simple_value=value) for tag, value in values.items()]
+        self._add(Summary(value=entries), step)
+
+    @property
+    def _seconds(self) -> float:
+        return time.perf_counter() - self._start
+
+    def stage_started(self, name: str, smoothing: float | None, index: int) -> None:
+        self._stage = index
+        self._writer.add_text("stage/started", f"{name}, ρ = {smoothing}" if smoothing else name, self._step)
+
+    def iteration(
+        self, record: Record, blocks: Callable[[], Mapping[str, float]], cost: Callable[[], float]
+    ) -> None:
+        self._step = int(record.get("step", self._step + 1))
+        values = {"residual/total": float(record["norm"])}
+        values |= {f"residual/{name}": float(norm) for name, norm in blocks().items()}
+        values |= {f"optim/{name}": float(record.get(name, math.nan)) for name in OPTIM_TAGS}
+        values["stage/index"] = float(self._stage)
+        smoothing = record.get("smoothing")
+        if smoothing is not None:
+            values["stage/smoothing"] = float(smoothing)
+        values["time/seconds"] = self._seconds
+        value = cost()
+        if math.isfinite(value):
+            values[self._cost_tag] = value
+        self._scalars(values, self._step)
+
+    def stage_ended(self, stage: StageResult) -> None:
+        if stage.solution is not None:
+            self._figures.append((self._step, stage.solution))
+        values = {
+            "stage/norm": stage.norm,
+            "stage/off_node_residual": stage.off_node_residual,
+            "stage/iterations": float(stage.n_iterations),
+            "stage/cpu_seconds": stage.cpu_seconds,
+        }
+        if math.isfinite(stage.cost):
+            values[self._cost_tag] = stage.cost
+        self._scalars(values, self._step)
+        self._writer.flush()
+
+    def certificate(self, certificate: Certificate) -> None:
+        values = {f"certificate/{name}": value for name, value in _numbers(certificate.to_dict()).items()}
+        self._scalars(values | {"time/seconds": self._seconds}, self._step)
+        self._writer.add_text("certificate", f"```\n{certificate.to_text()}\n```", self._step)
+        self._writer.flush()
+
+    def failed(self, reason: str) -> None:
+        self._failed = True
+        self._writer.add_text("failure", reason, self._step)
+
+    def close(self) -> None:
+        """Draw the stages' figures, which would have slowed the run down, and end the session."""
+        for step, solution in self._figures:
+            image = io.BytesIO()
+            figure = stage_figure(solution)
+            figure.savefig(image, format="png", dpi=80)
+            width, height = figure.canvas.get_width_height()
+            picture = Summary.Image(
+                height=height, width=width, colorspace=4, encoded_image_string=image.getvalue()
+            )
+            self._add(Summary(value=[Summary.Value(tag="stage/control", image=picture)]), step)
+        if not self._failed:  # what torch prepares says success; a session without an end reads as unknown
+            self._add(self._end, self._step)
+        self._writer.close()
