@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 from torch.func import grad, vjp
 
-from ponn_torch.optimal_control.control_laws import ControlSet, Minimiser, Regime
+from ponn_torch.optimal_control.control_laws import INTERIOR, LOWER, UPPER, ControlSet, Minimiser, Regime
 from ponn_torch.optimal_control.problem import Named, OptimalControlProblem, nearest
 
 MASS_VARIABLES = ("auto", "mass", "log_mass", "delta_v")
@@ -321,8 +321,13 @@ def _single_chains(bvp: BoundaryValueProblem) -> tuple[Chain, ...]:
 def find_chains(bvp: BoundaryValueProblem, n_probes: int = 32) -> tuple[Chain, ...]:
     """Find F_i ≡ k w_j by evaluating F at random points, join them, and mark chains whose last rate is zero."""
     t, w = _probe_points(bvp, n_probes)
-    smoothing = 0.3 + t
-    rates = bvp.rates(t, w, Setting(Regime(smoothing=smoothing), _parameters(bvp, t)))
+    regimes = [Regime(smoothing=0.3 + t)]
+    if getattr(bvp.law, "curved", False):
+        # a convex H follows one equation inside the bounds and others on them; a chain has to hold on every arc
+        one = torch.ones(n_probes, bvp.law.n_switching // 2, dtype=torch.long, device=t.device)
+        regimes += [Regime(arcs=code * one) for code in (LOWER, INTERIOR, UPPER)]
+    rates = torch.cat([bvp.rates(t, w, Setting(regime, _parameters(bvp, t))) for regime in regimes])
+    w = w.repeat(len(regimes), 1)
     scale = rates.abs().amax().clamp_min(1.0)
     follows: dict[int, tuple[int, float]] = {}
     for i in range(bvp.dimension):
