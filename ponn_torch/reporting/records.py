@@ -1,7 +1,7 @@
 """A run folder that records itself: progress on the terminal, records.jsonl, TensorBoard.
 
 The conductor calls one observer, ``RunRecorder``; it counts iterations over all stages, evaluates what is
-costly at most once, and hands each event on to its recorders. What they write is the same whatever the optimiser is.
+costly at most once, and hands each event on to its recorders. They write the same whatever the optimiser is.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""What a run folder says to people: report.md with figures, environment.json, and failures with their reason."""
+"""What a run folder says to people: report.md with figures, environment.json, failures with their reason."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ CAPTIONS = {
 }
 
 
-# -- environment -------------------------------------------------------------------------------------------------
+# -- environment --------------------------------------------------------------------------------------------
 
 
 def _git(folder: Path, *arguments: str) -> str | None:
@@ -56,7 +56,7 @@ def _git(folder: Path, *arguments: str) -> str | None:
 
 
 def commit() -> str | None:
-    """Commit of the checkout that this package runs from, with "+changes" where it was edited; None if installed."""
+    """Commit of the checkout that runs, with "+changes" where it was edited; None for an installed package."""
     root = Path(ponn_torch.__file__).resolve().parents[1]
     top = _git(root, "rev-parse", "--show-toplevel")
     # an installed package may lie inside some other project's repository
@@ -87,7 +87,7 @@ def write_environment(folder: Path | str) -> dict[str, Any]:
     return found
 
 
-# -- failures ----------------------------------------------------------------------------------------------------
+# -- failures -----------------------------------------------------------------------------------------------
 
 
 def _frames(error: BaseException) -> list[str]:
@@ -104,7 +104,7 @@ def _frames(error: BaseException) -> list[str]:
 
 
 def write_failure(folder: Path | str, reason: str, error: BaseException | None = None) -> None:
-    """Write failure.txt for people and failure.json for programs: the reason, and where an exception came from."""
+    """Write failure.txt for people and failure.json for programs: the reason, and where an error came from."""
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     kind, frames = (type(error).__name__, _frames(error)) if error is not None else (None, [])
@@ -113,7 +113,7 @@ def write_failure(folder: Path | str, reason: str, error: BaseException | None =
     (folder / FAILURE_TEXT).write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
-# -- the report --------------------------------------------------------------------------------------------------
+# -- the report ---------------------------------------------------------------------------------------------
 
 
 def write_report(
@@ -128,8 +128,8 @@ def write_report(
 ) -> Path:
     """Write report.md with all that is known, its figures, certificate.json and environment.json.
 
-    ``solution`` and ``certificate`` may be missing, as in a failed run; ``message`` is its reason. Returns the path
-    of the report.
+    ``solution`` and ``certificate`` may be missing, as in a failed run; ``message`` is its reason. Returns the
+    path of the report.
     """
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
