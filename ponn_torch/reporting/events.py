@@ -91,7 +91,7 @@ class TensorBoard(Recorder):
     def iteration(
         self, record: Record, blocks: Callable[[], Mapping[str, float]], cost: Callable[[], float]
     ) -> None:
-        self._step = int(record.get("step", self._step + 1))
+        self._step = int(record.get("global_step", self._step + 1))
         values = {"residual/total": float(record["norm"])}
         values |= {f"residual/{name}": float(norm) for name, norm in blocks().items()}
         values |= {f"optim/{name}": float(record.get(name, math.nan)) for name in OPTIM_TAGS}

@@ -129,7 +129,7 @@ class RunRecorder(Recorder):
     ) -> None:
         self.step += 1
         due = self._cost_every > 0 and self.step % self._cost_every == 0
-        numbered = {"step": self.step, **self._stage, **record}
+        numbered = {"global_step": self.step, **self._stage, **record}
         once_blocks = functools.cache(blocks)
         once_cost = functools.cache(cost if due else lambda: math.nan)
         for recorder in self.recorders:

@@ -56,7 +56,7 @@ def _git(folder: Path, *arguments: str) -> str | None:
 
 
 def commit() -> str | None:
-    """Commit of the checkout that runs, with "+changes" where it was edited; None for an installed package."""
+    """Commit of the checkout that runs, with "+changes" where it was edited; None if installed."""
     root = Path(ponn_torch.__file__).resolve().parents[1]
     top = _git(root, "rev-parse", "--show-toplevel")
     # an installed package may lie inside some other project's repository
@@ -104,7 +104,7 @@ def _frames(error: BaseException) -> list[str]:
 
 
 def write_failure(folder: Path | str, reason: str, error: BaseException | None = None) -> None:
-    """Write failure.txt for people and failure.json for programs: the reason, and where an error came from."""
+    """Write failure.txt for people and failure.json for programs: the reason, where an error came from."""
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     kind, frames = (type(error).__name__, _frames(error)) if error is not None else (None, [])
@@ -128,8 +128,8 @@ def write_report(
 ) -> Path:
     """Write report.md with all that is known, its figures, certificate.json and environment.json.
 
-    ``solution`` and ``certificate`` may be missing, as in a failed run; ``message`` is its reason. Returns the
-    path of the report.
+    ``solution`` and ``certificate`` may be missing, as in a failed run; ``message`` is its reason.
+    Returns the path of the report.
     """
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)

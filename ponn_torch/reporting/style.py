@@ -140,8 +140,10 @@ def number(value: float, shown: DisplayUnit, digits: int = 7) -> str:
 
 def arc_intervals(solution: Solution) -> list[tuple[float, float, str]]:
     """(start, end, label) of every arc, in s; [] where the solution is not split."""
-    knots = (solution.curve.times * solution.bvp.time_unit).tolist()
-    return list(zip(knots[:-1], knots[1:], solution.arcs, strict=True)) if solution.arcs else []
+    if not solution.arcs:
+        return []
+    ends = [0.0, *solution.switch_times, solution.final_time]
+    return list(zip(ends[:-1], ends[1:], solution.arcs, strict=True))
 
 
 # -- time axes ----------------------------------------------------------------------------------------------
