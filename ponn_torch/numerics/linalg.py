@@ -82,15 +82,16 @@ class ArrowJacobian:
     """K segments with unknowns of their own, coupled by a few shared ones.
 
     Rows: the segments' (K × R), then E extra rows that see shared unknowns only. Columns: the segments' own (K × P),
-    then G shared. Segment k's rows see its own columns through ``local`` (..., K, R, P) and the shared columns
-    ``index[k]`` through ``shared`` (..., K, R, S); an index of G means a column that is not an unknown.
-    ``extra`` is (..., E, G). Steps and gradients are ordered [segments' own, shared].
+    then G shared. Segment k's rows see its own columns through ``local`` (..., K, R, P) and S quantities through
+    ``shared`` (..., K, R, S) that depend linearly on the shared unknowns by ``spread`` (K, S, G): one-hot rows for
+    unknowns, zero rows for what is known, other weights for what lies between. ``extra`` is (..., E, G). Steps and
+    gradients are ordered [segments' own, shared].
     """
 
     local: Tensor
     shared: Tensor
     extra: Tensor
-    index: Tensor
+    spread: Tensor
 
     @property
     def n_shared(self) -> int:
@@ -99,12 +100,6 @@ class ArrowJacobian:
     @property
     def n_own(self) -> int:
         return self.local.shape[-3] * self.local.shape[-1]
-
-    @cached_property
-    def _spread(self) -> Tensor:
-        """One-hot (K, S, G): segment columns → shared unknowns; a column that is no unknown has a zero row."""
-        one_hot = torch.nn.functional.one_hot(self.index, self.n_shared + 1)
-        return one_hot[..., : self.n_shared].to(self.local.dtype)
 
     @cached_property
     def _normal(self) -> tuple[Tensor, Tensor, Tensor]:
@@ -120,19 +115,19 @@ class ArrowJacobian:
 
     def _gather(self, shared: Tensor) -> Tensor:
         """Shared unknowns (..., G) as the segments see them (..., K, S)."""
-        return torch.einsum("ksg,...g->...ks", self._spread, shared)
+        return torch.einsum("ksg,...g->...ks", self.spread, shared)
 
     def _scatter(self, segments: Tensor) -> Tensor:
         """Sum the segments' columns (..., K, S) into (..., G)."""
-        return torch.einsum("ksg,...ks->...g", self._spread, segments)
+        return torch.einsum("ksg,...ks->...g", self.spread, segments)
 
     def _scatter_matrix(self, blocks: Tensor) -> Tensor:
         """Sum (..., K, S, S) into (..., G, G)."""
-        return (self._spread.mT @ blocks @ self._spread).sum(-3)
+        return (self.spread.mT @ blocks @ self.spread).sum(-3)
 
     def column_norms(self) -> Tensor:
         own, _, shared = self._normal
-        coupled = self._scatter(shared.diagonal(dim1=-2, dim2=-1)) + (self.extra**2).sum(-2)
+        coupled = self._scatter_matrix(shared).diagonal(dim1=-2, dim2=-1) + (self.extra**2).sum(-2)
         return torch.cat([own.diagonal(dim1=-2, dim2=-1).flatten(-2), coupled], -1).sqrt()
 
     def gradient(self, residual: Tensor) -> Tensor:
@@ -156,7 +151,7 @@ class ArrowJacobian:
         for i in range(k):
             block = slice(i * rows, (i + 1) * rows)
             out[..., block, i * own : (i + 1) * own] = self.local[..., i, :, :]
-            out[..., block, self.n_own :] = self.shared[..., i, :, :] @ self._spread[i]
+            out[..., block, self.n_own :] = self.shared[..., i, :, :] @ self.spread[i]
         out[..., k * rows :, self.n_own :] = self.extra
         return out
 
@@ -189,7 +184,7 @@ class ArrowJacobian:
         stacked = torch.cat([self.local, self.shared, segments.unsqueeze(-1)], -1)
         head, tail = _qr_tail(stacked, scale_own, damping, n)
         # what each segment leaves over for the shared unknowns, in their numbering
-        left_over = torch.cat([tail[..., :-1] @ self._spread, tail[..., -1:]], -1).flatten(-3, -2)
+        left_over = torch.cat([tail[..., :-1] @ self.spread, tail[..., -1:]], -1).flatten(-3, -2)
         rows = torch.cat([left_over, torch.cat([self.extra, extra.unsqueeze(-1)], -1)], -2)
         step = _back_substitute(_qr_tail(rows, scale_shared, damping[..., 0], g)[0], g).squeeze(-1)
         known = head[..., n:-1] @ self._gather(step).unsqueeze(-1) + head[..., -1:]

@@ -16,15 +16,15 @@ from functools import cached_property
 
 import torch
 from torch import Tensor
-from torch.func import jacrev, vjp, vmap
+from torch.func import vjp, vmap
 
 from ponn_torch.ansatz.basis import LinearBasis
 from ponn_torch.ansatz.constraints import hermite
 from ponn_torch.ansatz.expression import ConstrainedExpression
 from ponn_torch.numerics.linalg import ArrowJacobian
 from ponn_torch.numerics.nodes import NodeSet, legendre_moments
-from ponn_torch.optimal_control.control_laws import Regime
-from ponn_torch.optimal_control.pontryagin import BoundaryValueProblem, Setting
+from ponn_torch.optimal_control.control_laws import INTERIOR, Regime
+from ponn_torch.optimal_control.pontryagin import BoundaryValueProblem, Setting, probe_points, probe_settings
 
 
 # -- test functions: how the pointwise residual becomes rows --------------------------------------------------------------
@@ -155,22 +155,20 @@ class Discretisation:
     @cached_property
     def last_columns(self) -> Tensor:
         """Columns of F that the non-trivial chains' equations use, in the order of the groups."""
-        return torch.cat([g.columns[:, -1] for g in self.groups if not g.trivial])
+        none = torch.zeros(0, dtype=torch.long, device=self.nodes.points.device)
+        return torch.cat([none, *(g.columns[:, -1] for g in self.groups if not g.trivial)])
 
     @cached_property
     def couplings(self) -> Tensor:
-        """Boolean (2n, 2n): F_i depends on w_j, found at random points of the smoothed equations."""
-        bvp = self.bvp
-        generator = torch.Generator().manual_seed(1)
-        w = 0.5 + torch.rand(16, bvp.dimension, generator=generator, dtype=torch.float64).to(self.nodes.points)
-        t = w[:, :1]
-        parameters = {k: torch.full_like(t, v) for k, v in bvp.problem.parameters.items()}
-        setting = Setting(Regime(smoothing=0.5 + t), parameters)
-        jacobian = vmap(jacrev(lambda t, w, s: bvp.rates(t, w, Setting(Regime(smoothing=s), setting.parameters)), 1))
-        if parameters:
-            one = Setting(Regime(smoothing=t[:1]), {k: v[:1] for k, v in parameters.items()})
-            return torch.stack([jacrev(lambda w: bvp.rates(t[:1], w, one)[0])(x[None])[:, 0] for x in w]).abs().amax(0) > 0
-        return jacobian(t, w, setting.regime.smoothing).abs().amax(0) > 0
+        """Boolean (2n, 2n): F_i depends on w_j, found at random points."""
+        bvp, found = self.bvp, []
+        t, w = probe_points(bvp, 16, seed=1)
+        seeds = torch.eye(bvp.dimension, dtype=w.dtype, device=w.device)
+        for setting in probe_settings(bvp, t):
+            rates, pull = vjp(lambda w, setting=setting: bvp.rates(t, w, setting), w)
+            by_w = vmap(lambda seed, rates=rates, pull=pull: pull(seed.expand_as(rates))[0])(seeds)
+            found.append(by_w.abs().amax(1) > 0)
+        return torch.stack(found).any(0)
 
 
 @dataclass(frozen=True)
@@ -192,16 +190,15 @@ class Collocation:
 
     Attributes:
         known_knots: (..., K+1, 2n) scaled values; NaN marks an unknown entry, the same in the whole batch.
-        known_times: (..., K+1) scaled, ascending; where ``free_times`` holds they are first guesses.
-        free_times: (K+1,) booleans.
-        events: per interior knot, the index of the switching function that vanishes there, or None.
+        known_times: (..., K+1) scaled, ascending; first guesses of those that are unknown.
+        events: per interior knot, the index of the switching function that vanishes there, its time unknown; or
+            None: the knot only subdivides, at the same fraction of the way between its neighbouring switches or ends.
         setting: the regime (smoothing (...,), or arc codes (..., K, m)) and parameters (...,) by name.
     """
 
     discretisation: Discretisation
     known_knots: Tensor
     known_times: Tensor
-    free_times: Tensor
     setting: Setting
     events: tuple[int | None, ...] = ()
 
@@ -214,26 +211,25 @@ class Collocation:
         setting: Setting | None = None,
         events: Sequence[int | None] | None = None,
     ) -> Collocation:
-        """Segments between scaled ``times`` (K+1,); interior knots are unknown, times too where an event is named."""
+        """Segments between scaled ``times`` (K+1,), interior knot values unknown."""
         bvp = discretisation.bvp
         n_segments = times.shape[-1] - 1
         events = tuple(events) if events is not None else (None,) * (n_segments - 1)
         knots = torch.full((n_segments + 1, bvp.dimension), torch.nan, dtype=times.dtype, device=times.device)
         knots[0], knots[-1] = bvp.known_initial, bvp.known_final
-        free = [False, *(e is not None for e in events), bvp.problem.free_final_time]
         if setting is None:
             setting = Setting(parameters={k: times.new_tensor(v) for k, v in bvp.problem.parameters.items()})
-        return cls(discretisation, knots, times, torch.tensor(free, device=times.device), setting, events)
+        return cls(discretisation, knots, times, setting, events)
 
     def with_setting(self, *, smoothing: float | Tensor | None = None, **parameters: float | Tensor) -> Collocation:
         """The same residual at another smoothing or other values of named parameters."""
         regime, values = self.setting.regime, dict(self.setting.parameters)
         if smoothing is not None:
-            regime = replace(regime, smoothing=torch.as_tensor(smoothing).to(self.known_times))
+            regime = replace(regime, smoothing=torch.as_tensor(smoothing, dtype=self.known_times.dtype).to(self.known_times))
         for name, value in parameters.items():
             if name not in values:
                 raise ValueError(f"no parameter named {name!r}; allowed: smoothing, {', '.join(values)}")
-            values[name] = torch.as_tensor(value).to(self.known_times)
+            values[name] = torch.as_tensor(value, dtype=self.known_times.dtype).to(self.known_times)
         return replace(self, setting=Setting(regime, values))
 
     # -- layout ------------------------------------------------------------------------------------------------------
@@ -253,8 +249,25 @@ class Collocation:
         return unknown.reshape(-1, unknown.shape[-1])[0].nonzero()[:, 0]
 
     @cached_property
-    def free_time_index(self) -> Tensor:
-        return self.free_times.nonzero()[:, 0]
+    def free_times(self) -> Tensor:
+        """Knots whose times are unknowns: the switches, and the end where the final time is free."""
+        free = [False, *(event is not None for event in self.events), self.bvp.problem.free_final_time]
+        return torch.tensor(free, device=self.known_times.device).nonzero()[:, 0]
+
+    @cached_property
+    def time_map(self) -> tuple[Tensor, Tensor]:
+        """(base (..., K+1), map (K+1, F)) with knot times = base + map @ free times."""
+        k, known = self.n_segments, self.known_times
+        anchors = [0, *self.switch_knots, k]
+        first = known.reshape(-1, k + 1)[0].tolist()
+        weights = known.new_zeros(k + 1, k + 1)  # knot times from anchor times
+        for a, b in zip(anchors[:-1], anchors[1:], strict=True):
+            for i in range(a, b + 1):
+                fraction = (first[i] - first[a]) / (first[b] - first[a])
+                weights[i, a], weights[i, b] = 1.0 - fraction, fraction
+        free = self.free_times
+        fixed = [i for i in range(k + 1) if i not in free.tolist()]
+        return (weights[:, fixed] @ known[..., fixed].unsqueeze(-1)).squeeze(-1), weights[:, free]
 
     @property
     def n_weights(self) -> int:
@@ -266,7 +279,7 @@ class Collocation:
 
     @property
     def n_shared(self) -> int:
-        return len(self.free_knots) + len(self.free_time_index) + self.bvp.n_multipliers
+        return len(self.free_knots) + len(self.free_times) + self.bvp.n_multipliers
 
     @property
     def linear_unknowns(self) -> slice:
@@ -278,12 +291,11 @@ class Collocation:
         batch, k = xi.shape[:-1], self.n_segments
         weights = xi[..., : self.n_weights].unflatten(-1, (k, self.discretisation.n_own))
         knot_end = self.n_weights + len(self.free_knots)
-        time_end = knot_end + len(self.free_time_index)
+        time_end = knot_end + len(self.free_times)
         knots = self.known_knots.flatten(-2).expand(*batch, -1)
         knots = knots.index_copy(-1, self.free_knots, xi[..., self.n_weights : knot_end])
-        times = self.known_times.expand(*batch, -1)
-        if len(self.free_time_index):
-            times = times.index_copy(-1, self.free_time_index, xi[..., knot_end:time_end])
+        base, between = self.time_map
+        times = (base + xi[..., knot_end:time_end] @ between.mT).expand(*batch, -1)
         return Unknowns(weights, knots.unflatten(-1, (k + 1, self.bvp.dimension)), times, xi[..., time_end:])
 
     def pack(self, unknowns: Unknowns) -> Tensor:
@@ -292,7 +304,7 @@ class Collocation:
             [
                 unknowns.weights.flatten(-2),
                 unknowns.knots.flatten(-2)[..., self.free_knots],
-                unknowns.times[..., self.free_time_index],
+                unknowns.times[..., self.free_times],
                 unknowns.multipliers,
             ],
             -1,
@@ -372,7 +384,7 @@ class Collocation:
         extra = self._extra_rows(unknowns.knots, unknowns.times, unknowns.multipliers)
         rows = torch.cat([equations.flatten(-2), extra], -1)
         # segments must keep their order: a step that turns one around is to be rejected
-        return torch.where((h > 0).all(-1, keepdim=True), rows, torch.nan) if len(self.free_time_index) else rows
+        return torch.where((h > 0).all(-1, keepdim=True), rows, torch.nan) if len(self.free_times) else rows
 
     def linearise(self, xi: Tensor) -> tuple[Tensor, ArrowJacobian]:
         """(r, J): pointwise cotangents of F by vmapped vjp, pulled back through the tables."""
@@ -409,7 +421,7 @@ class Collocation:
             rows.copy_((group.test @ ends).flatten(-3, -2))
         extra_value, extra = self._extra_linearised(unknowns)
         residual = torch.cat([equations.flatten(-2), extra_value], -1)
-        return residual, ArrowJacobian(local, shared, extra, self._shared_index)
+        return residual, ArrowJacobian(local, shared, extra, self._spread)
 
     def _rates_and_slopes(self, t: Tensor, w: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """F (..., 2n) and, for the equations in use, ∂F/∂t (..., rows) and ∂F/∂w (..., rows, 2n)."""
@@ -417,6 +429,8 @@ class Collocation:
         setting = self.point_setting(shape[:-1])
         rates, pull = vjp(lambda a, b: self.bvp.rates(a, b, setting), t.reshape(-1, 1), w.reshape(-1, shape[-1]))
         rows = self.discretisation.last_columns
+        if not len(rows):
+            return rates.view(shape), w[..., :0], w.unsqueeze(-2)[..., :0, :]
         seeds = torch.zeros(len(rows), shape[-1], dtype=w.dtype, device=w.device)
         seeds[torch.arange(len(rows)), rows] = 1.0
         by_t, by_w = vmap(lambda seed: pull(seed.expand_as(rates)))(seeds)
@@ -512,15 +526,15 @@ class Collocation:
                 shared[..., group.rows, index] = by_knot.flatten(-4, -3).flatten(-2)
 
     @cached_property
-    def _shared_index(self) -> Tensor:
-        """(K, S): position among the shared unknowns of a segment's [left knot, right knot, t₀, t₁]; n_shared if known."""
-        k, width, device = self.n_segments, self.bvp.dimension, self.known_times.device
-        knots = torch.full(((k + 1) * width,), self.n_shared, device=device)
-        knots[self.free_knots] = torch.arange(len(self.free_knots), device=device)
-        times = torch.full((k + 1,), self.n_shared, device=device)
-        times[self.free_time_index] = len(self.free_knots) + torch.arange(len(self.free_time_index), device=device)
-        knots = knots.view(k + 1, width)
-        return torch.cat([knots[:-1], knots[1:], times[:-1, None], times[1:, None]], -1)
+    def _spread(self) -> Tensor:
+        """(K, S, G): a segment's [left knot, right knot, t₀, t₁] from the shared unknowns, as far as they depend on them."""
+        k, width, n_knots = self.n_segments, self.bvp.dimension, len(self.free_knots)
+        knots = self.known_times.new_zeros((k + 1) * width, self.n_shared)
+        knots[self.free_knots, torch.arange(n_knots, device=knots.device)] = 1.0
+        knots = knots.view(k + 1, width, self.n_shared)
+        times = self.known_times.new_zeros(k + 1, self.n_shared)
+        times[:, n_knots : n_knots + len(self.free_times)] = self.time_map[1]
+        return torch.cat([knots[:-1], knots[1:], times[:-1, None], times[1:, None]], -2)
 
     # -- rows that see knots, times and multipliers only ----------------------------------------------------------------
 
@@ -562,7 +576,7 @@ class Collocation:
         jacobian = torch.cat(
             [
                 by_knots.flatten(-2)[..., self.free_knots],
-                by_times[..., self.free_time_index],
+                by_times @ self.time_map[1],
                 by_multipliers,
             ],
             -1,

@@ -149,6 +149,11 @@ class ControlSet(Protocol):
         """Number of switching functions; 0 where the control has no bound."""
         ...
 
+    @property
+    def curved(self) -> bool:
+        """Whether H is convex in the bounded control: every component then has two switching functions."""
+        ...
+
     def probe(self, one: Tensor) -> dict[str, Tensor]:
         """An admissible control with the batch shape of ``one`` (..., 1)."""
         ...
@@ -187,6 +192,10 @@ class Unconstrained:
     @property
     def n_switching(self) -> int:
         return 0
+
+    @property
+    def curved(self) -> bool:
+        return False
 
     def probe(self, one: Tensor) -> dict[str, Tensor]:
         return {self.name: one.expand(*one.shape[:-1], self.size)}

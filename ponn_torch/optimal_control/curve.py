@@ -95,6 +95,10 @@ class Curve:
         segment = torch.arange(len(parts), device=self.xi.device).repeat_interleave(n_points)
         return t, rate - self.collocation.bvp.rates(t[:, None], w, self.setting(segment))
 
+    def off_node_residuals(self, n_points: int = 50) -> Tensor:
+        """Largest |ẇ − F| off the nodes of every segment (K,), in scaled units."""
+        return self.defect(n_points)[1].abs().amax(-1).view(-1, n_points).amax(-1)
+
     def off_node_residual(self, n_points: int = 200) -> float:
         """Largest |ẇ − F| off the nodes, in scaled units."""
         return float(self.defect(n_points)[1].abs().max())

@@ -8,7 +8,7 @@ to the constants c, so the costs, S and the control law stay those of the user's
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -282,13 +282,13 @@ def _boundary(bvp: BoundaryValueProblem) -> dict[str, Any]:
                 w[bvp.n_states + i] = torch.nan
         out[f"known_{end}"] = w
     if problem.terminal_manifold is not None:
-        one, p = _probe_points(bvp, 2)[0], Named(**{k: torch.full((2, 1), v) for k, v in problem.parameters.items()})
+        one, p = probe_points(bvp, 2)[0], Named(**{k: torch.full((2, 1), v) for k, v in problem.parameters.items()})
         psi = problem.terminal_manifold(one, problem.named(bvp.unit.expand(2, -1)), p)
         out["n_multipliers"] = psi.shape[-1]
     return out
 
 
-def _probe_points(bvp: BoundaryValueProblem, count: int, seed: int = 0) -> tuple[Tensor, Tensor]:
+def probe_points(bvp: BoundaryValueProblem, count: int, seed: int = 0) -> tuple[Tensor, Tensor]:
     """Random (t, w) of order one for structural probes, away from zeros."""
     generator = torch.Generator().manual_seed(seed)
     values = 0.5 + torch.rand(count, 1 + bvp.dimension, generator=generator, dtype=torch.float64)
@@ -300,8 +300,17 @@ def _parameters(bvp: BoundaryValueProblem, like: Tensor) -> dict[str, Tensor]:
     return {name: torch.full_like(like, value) for name, value in bvp.problem.parameters.items()}
 
 
+def probe_settings(bvp: BoundaryValueProblem, t: Tensor) -> list[Setting]:
+    """Settings under which the structure of F shows: smoothed, and off all bounds (a clipped law hides couplings)."""
+    parameters = _parameters(bvp, t)
+    interior = torch.full((*t.shape[:-1], bvp.law.n_switching), INTERIOR, device=t.device)
+    if bvp.law.curved:
+        interior = interior.chunk(2, -1)[0]
+    return [Setting(regime, parameters) for regime in (Regime(smoothing=0.3 + t), Regime(arcs=interior))]
+
+
 def _adapted_law(bvp: BoundaryValueProblem) -> ControlSet:
-    t, w = _probe_points(bvp, 8)
+    t, w = probe_points(bvp, 8)
     x, costates = bvp.to_physical(w)
     p = Named(**_parameters(bvp, t))
 
@@ -320,7 +329,7 @@ def _single_chains(bvp: BoundaryValueProblem) -> tuple[Chain, ...]:
 
 def find_chains(bvp: BoundaryValueProblem, n_probes: int = 32) -> tuple[Chain, ...]:
     """Find F_i ≡ k w_j by evaluating F at random points, join them, and mark chains whose last rate is zero."""
-    t, w = _probe_points(bvp, n_probes)
+    t, w = probe_points(bvp, n_probes)
     regimes = [Regime(smoothing=0.3 + t)]
     if getattr(bvp.law, "curved", False):
         # a convex H follows one equation inside the bounds and others on them; a chain has to hold on every arc
@@ -352,6 +361,3 @@ def find_chains(bvp: BoundaryValueProblem, n_probes: int = 32) -> tuple[Chain, .
             used.add(j)
         out.append(Chain(tuple(columns), tuple(factors), bool(zero[columns[-1]])))
     return tuple(sorted(out, key=lambda chain: chain.columns))
-
-
-RatesFunction = Callable[[Tensor, Tensor, Setting], Tensor]

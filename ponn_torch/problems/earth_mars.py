@@ -12,15 +12,17 @@ from ponn_torch.problems.constants import ASTRONOMICAL_UNIT, DAY, KILOMETRE, STA
 from ponn_torch.problems.known import known_optimum
 
 TIME_UNIT = 58.132 * DAY
+INITIAL_STATE_KM = (-140699693.0, -51614428.0, 980.0, 9.774596, -28.07828, 4.337725e-4)  # km, km/s
+FINAL_STATE_KM = (-172682023.0, 176959469.0, 7948912.0, -16.427384, -14.860506, 9.21486e-2)
 OPTIMA_KG: list[tuple[dict[str, object], float]] = [({}, 396.05984393)]
 
 
 def earth_mars(
     *,
-    initial_position_km: Sequence[float] = (-140699693.0, -51614428.0, 980.0),
-    initial_velocity_km_s: Sequence[float] = (9.774596, -28.07828, 4.337725e-4),
-    final_position_km: Sequence[float] = (-172682023.0, 176959469.0, 7948912.0),
-    final_velocity_km_s: Sequence[float] = (-16.427384, -14.860506, 9.21486e-2),
+    initial_position_km: Sequence[float] = INITIAL_STATE_KM[:3],
+    initial_velocity_km_s: Sequence[float] = INITIAL_STATE_KM[3:],
+    final_position_km: Sequence[float] = FINAL_STATE_KM[:3],
+    final_velocity_km_s: Sequence[float] = FINAL_STATE_KM[3:],
     initial_mass: float = 1000.0,
     final_time_days: float = 348.795,
     maximum_thrust: float = 0.5,

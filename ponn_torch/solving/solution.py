@@ -111,11 +111,12 @@ class Solution:
 
     @property
     def arcs(self) -> list[str]:
-        """One label per segment ("max", "min", "interior"), components joined by ","; [] if not split."""
+        """One label per arc ("max", "min", "interior"), components joined by ","; [] if not split."""
         codes = self.curve.collocation.setting.regime.arcs
         if codes is None:
             return []
-        return [",".join(ARC_LABELS[code] for code in row) for row in codes.tolist()]
+        first = codes[[0, *self.curve.collocation.switch_knots]]
+        return [",".join(ARC_LABELS[code] for code in row) for row in first.tolist()]
 
     @property
     def final_time(self) -> float:
@@ -210,11 +211,13 @@ class Solution:
         even = times[0] + (times[-1] - times[0]) * even
         even[-1] = times[-1]
         switches = self.curve.collocation.switch_knots
-        even = even[~torch.isin(even, times[switches])]
+        near = (even[:, None] - times[switches]).abs() < 1e-12 * (times[-1] - times[0])
+        even = even[~near.any(-1)]
         t = torch.cat([even, times[switches], times[switches]])
         before = torch.tensor(switches, dtype=torch.long, device=times.device)
         segment = torch.cat([self.curve.segment_of(even), before - 1, before])
-        order = torch.argsort(segment.to(t.dtype) * 2 * times[-1] + t, stable=True)
+        order = torch.argsort(t)
+        order = order[torch.argsort(segment[order], stable=True)]
         return self._samples(t[order], segment[order])
 
     # -- files -----------------------------------------------------------------------------------------------

@@ -60,6 +60,7 @@ class Solver:
         node_kind, n_nodes: collocation points per segment. form: strong or weak residual. n_segments: fixed segments.
         optimizer, continuation, guess: of the smoothed stages. refinement: None to stop at the smoothed solution.
         n_starts: random starts to try at most; start i of seed s uses the random stream 1000 s + i.
+        n_certified: stop at this many certified extremals and keep the cheapest; several extremals are real.
         start_limit: ‖r‖ of the first stage above which a start has failed.
         trust: a stage is kept while its off-node residual is below this fraction of the largest rate; below the
             resolution of the nodes the residual between them gives a broken stage away.
@@ -76,6 +77,7 @@ class Solver:
     refinement: Split | None = field(default_factory=Split)
     guess: Guess = field(default_factory=RandomGuess)
     n_starts: int = 10
+    n_certified: int = 1
     start_limit: float = 0.1
     trust: float = 0.02
     mass_variable: str = "auto"
@@ -84,7 +86,7 @@ class Solver:
     device: str = "cpu"
 
     def __post_init__(self) -> None:
-        for name in ("n_nodes", "n_segments", "n_starts"):
+        for name in ("n_nodes", "n_segments", "n_starts", "n_certified"):
             value = getattr(self, name)
             if value < 1:
                 raise ValueError(f"{name} = {value}; allowed: at least 1")
@@ -109,7 +111,6 @@ class _Run:
 
     def __init__(self, solver: Solver, problem: OptimalControlProblem, seed: int, observer: Observer) -> None:
         self.solver, self.problem, self.seed, self.observer = solver, problem, seed, observer
-        self.watch = Stopwatch()
         self.bvp = pontryagin(problem, mass_variable=solver.mass_variable, dtype=solver.dtype, device=solver.device)
         self.discretisations: dict[Form, Discretisation] = {}
         self.stages: list[StageResult] = []
@@ -118,39 +119,44 @@ class _Run:
     # -- the line ------------------------------------------------------------------------------------------------------
 
     def result(self) -> SolveResult:
-        best: Solution | None = None
-        certificate: Certificate | None = None
-        message, interrupted = "", False
+        best: tuple[Solution, Certificate] | None = None
+        message, interrupted, n_certified = "", False, 0
+        seconds = 0.0  # certificates apart
         try:
             for self.start in range(self.solver.n_starts):
-                smoothed, message = self._continuation()
-                if smoothed is None:
+                watch = Stopwatch()
+                candidate, note = self._one_start()
+                seconds += watch.seconds
+                message = note or message
+                if candidate is None:
                     continue
-                candidate, note = self._refined(smoothed)
-                seconds = self.watch.seconds
                 judged = certify(candidate, self.solver.tolerances)
-                if certificate is None or judged.certified:
-                    best, certificate, message = candidate, judged, note or judged.verdict
-                if judged.certified:
+                n_certified += judged.certified
+                if best is None or _better(judged, best[1]):
+                    best, message = (candidate, judged), note or judged.verdict
+                if n_certified == self.solver.n_certified:
                     break
         except _Interrupted:
             interrupted, message = True, "interrupted; the best stage so far is kept"
-            best = best or self._best_stage()
-        else:
-            seconds = self.watch.seconds if best is None else seconds
-        if best is None:
-            best = self._best_stage()
-            message = message or "no start led to a solution"
+            seconds += watch.seconds
+        solution = best[0] if best else self._last_stage()
+        if solution is not None:
+            self.observer.solution(solution)
         if best is not None:
-            self.observer.solution(best)
-        if certificate is not None:
-            self.observer.certificate(certificate)
-        if best is None or certificate is None:
+            self.observer.certificate(best[1])
+        else:
             self.observer.failed(message)
-        seconds = self.watch.seconds if interrupted else seconds
-        return SolveResult(best, certificate, self.stages, self.start + 1, message, seconds, interrupted)
+        certificate = best[1] if best else None
+        return SolveResult(solution, certificate, self.stages, self.start + 1, message, seconds, interrupted)
 
-    def _best_stage(self) -> Solution | None:
+    def _one_start(self) -> tuple[Solution | None, str]:
+        """Everything between a first guess and a trajectory to be judged; None and why where that fails."""
+        smoothed, message = self._continuation()
+        if smoothed is None:
+            return None, message
+        return self._refined(smoothed)
+
+    def _last_stage(self) -> Solution | None:
         solutions = [s.solution for s in self.stages if s.solution is not None]
         return solutions[-1] if solutions else None
 
@@ -162,13 +168,17 @@ class _Run:
             self.discretisations[key] = self.solver.discretisation(self.bvp, key)
         return self.discretisations[key]
 
+    @property
+    def _smoothable(self) -> bool:
+        return self.bvp.law.n_switching > 0 and not self.bvp.law.curved
+
     def _continuation(self) -> tuple[Solution | None, str]:
         """Walk the schedule from one start; the sharpest stage that can be trusted, or None and why."""
         solver, bvp = self.solver, self.bvp
         like = bvp.unit
         times = torch.linspace(0.0, 1.0, solver.n_segments + 1, dtype=like.dtype, device=like.device) * bvp.final_time
         current = Collocation.on_segments(self._discretisation(None), times)
-        if bvp.law.n_switching:
+        if self._smoothable:
             current = current.with_setting(smoothing=1.0)
         xi = project(current, solver.guess.curve(bvp, 1000 * self.seed + self.start))
         kept: Solution | None = None
@@ -177,10 +187,11 @@ class _Run:
 
         def attempt(value: float, parameter: str, form: Form | None) -> Outcome:
             nonlocal current, xi, kept, message, first
-            if parameter == "smoothing" and not bvp.law.n_switching:
-                trial = replace(current, discretisation=self._discretisation(form))
-            else:
-                trial = replace(current, discretisation=self._discretisation(form)).with_setting(**{parameter: value})
+            trial = replace(current, discretisation=self._discretisation(form))
+            if parameter != "smoothing" or self._smoothable:
+                trial = trial.with_setting(**{parameter: value})
+            elif not first:
+                return Outcome.ABORT  # nothing to smooth: one stage is all there is
             try:
                 result = self._optimise("smooth", trial, xi, solver.optimizer)
             except NonFiniteResidual as error:
@@ -219,7 +230,7 @@ class _Run:
     def _refined(self, smoothed: Solution) -> tuple[Solution, str]:
         """The split solution where it is consistent, else the smoothed one and why."""
         split = self.solver.refinement
-        if split is None or not self.bvp.law.n_switching:
+        if split is None:
             return smoothed, ""
         self.observer.stage_started("split", None, len(self.stages))
         outcome = split.run(smoothed.curve, self._callback)
@@ -290,6 +301,13 @@ class _Run:
         )
         self.stages.append(stage)
         self.observer.stage_ended(stage)
+
+
+def _better(one: Certificate, other: Certificate) -> bool:
+    """Certified before not, then cheaper; of two that are not, the one found first stays."""
+    if one.certified != other.certified:
+        return one.certified
+    return one.certified and one.cost < other.cost
 
 
 def _smoothing(collocation: Collocation) -> float | None:

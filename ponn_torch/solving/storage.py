@@ -35,12 +35,11 @@ def save_curve(curve: Curve, folder: Path) -> None:
         "xi": curve.xi,
         "known_knots": collocation.known_knots,
         "known_times": collocation.known_times,
-        "free_times": collocation.free_times,
         "node_points": disc.nodes.points,
         "node_weights": disc.nodes.weights,
         "arcs": setting.regime.arcs,
         "smoothing": setting.regime.smoothing,
-        "check": _fingerprint(curve),
+        **{f"check/{name}": value for name, value in _fingerprint(curve).items()},
         **{f"parameter/{name}": value for name, value in setting.parameters.items()},
         **{f"basis/{name}": value for name, value in disc.basis.state_dict().items()},
     }
@@ -113,12 +112,11 @@ def load_curve(folder: Path, problem: OptimalControlProblem | None = None) -> Cu
         discretisation=discretisation,
         known_knots=arrays["known_knots"],
         known_times=arrays["known_times"],
-        free_times=arrays["free_times"],
         setting=Setting(Regime(arrays.get("smoothing"), arrays.get("arcs")), _under("parameter", arrays)),
         events=tuple(description["events"]),
     )
     curve = Curve(collocation, xi)
-    _check(curve, arrays["check"], folder)
+    _check(curve, _under("check", arrays), folder)
     return curve
 
 
@@ -157,19 +155,36 @@ def _make_basis(saved: dict[str, Any], buffers: dict[str, Tensor], dtype: torch.
     return basis
 
 
-def _fingerprint(curve: Curve) -> Tensor:
-    """w at a few points of every segment (K, 5, 2n)."""
+def _fingerprint(curve: Curve) -> dict[str, Tensor]:
+    """What tells one curve of one problem from another: values and rates at a few points, and boundary data."""
+    bvp, n_segments = curve.collocation.bvp, curve.collocation.n_segments
     z = torch.linspace(-0.9, 0.8, 5, dtype=curve.xi.dtype, device=curve.xi.device)
-    return torch.stack([curve.on_segment(z, k)[1] for k in range(curve.collocation.n_segments)])
+    t, w, _ = (torch.cat(parts) for parts in zip(*(curve.on_segment(z, k) for k in range(n_segments)), strict=True))
+    segment = torch.arange(n_segments, device=z.device).repeat_interleave(len(z))
+    states, costates = bvp.to_physical(w)
+    time = curve.times[-1:] if bvp.problem.free_final_time else curve.times.new_tensor([bvp.final_time])
+    return {
+        "curve": w,
+        "states": states,
+        "costates": costates,
+        "rates": bvp.rates(t[:, None], w, curve.setting(segment)),
+        "boundary": torch.cat([bvp.known_initial, bvp.known_final, time])[None],
+    }
 
 
-def _check(curve: Curve, saved: Tensor, folder: Path) -> None:
-    """The basis is conditioned anew; make sure that the weights still mean the same functions."""
+def _check(curve: Curve, saved: dict[str, Tensor], folder: Path) -> None:
+    """Basis and problem are made anew: make sure that the weights still mean the same."""
     found = _fingerprint(curve)
-    limit = 1e6 * torch.finfo(saved.dtype).eps * saved.abs().amax().clamp_min(1.0)
-    error = (found - saved).abs().max() if found.shape == saved.shape else torch.tensor(torch.inf)
-    if not bool(error <= limit):
-        raise ValueError(
-            f"{folder / WEIGHTS}: the rebuilt curve misses the saved points by {float(error):.1e} (scaled); "
-            "another problem, or another release of the basis, than the one that was solved"
+    for name, expected in saved.items():
+        scale = torch.nan_to_num(expected.abs()).amax(0)
+        limit = 1e6 * torch.finfo(expected.dtype).eps
+        same = found[name].shape == expected.shape and bool(
+            torch.isclose(found[name], expected, rtol=limit, atol=0.0, equal_nan=True)
+            .logical_or((found[name] - expected).abs() <= limit * scale)
+            .all()
         )
+        if not same:
+            raise ValueError(
+                f"{folder / WEIGHTS}: the rebuilt {name} is not the saved one; the problem or the basis is another "
+                "than the one that was solved"
+            )
