@@ -1,0 +1,194 @@
+"""Reading the command line: options, overrides, a user's problem; what is wrong with them is one line."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from difflib import get_close_matches
+from pathlib import Path
+from typing import Any
+
+from hydra import compose, initialize_config_dir
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.override_parser.types import Glob, Override, OverrideType
+from hydra.errors import HydraException
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+CONFIG = "solve"
+SWITCHES = ("--multirun", "-m", "--resolve", "--info", "--hydra-help", "--shell-completion")
+WITH_VALUE = ("--cfg", "-c", "--package", "-p", "--info", "-i", "--config-dir", "-cd")
+VALUES = ("job", "hydra", "all", "config", "defaults", "defaults-tree", "plugins", "searchpath")
+
+
+class InputError(ValueError):
+    """Something wrong with what was typed, in one line."""
+
+
+@dataclass(frozen=True)
+class Command:
+    """Hydra's options, overrides, and the config of a single run (None for a sweep, or for an inspection)."""
+
+    options: list[str]
+    overrides: list[str]
+    config: DictConfig | None
+
+    @property
+    def multirun(self) -> bool:
+        return "-m" in self.options or "--multirun" in self.options
+
+
+def config_folder() -> Path:
+    """Beside the package in an installation, at the top of the repository in a checkout."""
+    package = Path(__file__).resolve().parents[1]
+    for folder in (package / "configs", package.parent / "configs"):
+        if (folder / f"{CONFIG}.yaml").is_file():
+            return folder
+    raise InputError(f"configs are missing: no {CONFIG}.yaml beside the package; install it again")
+
+
+def groups() -> dict[str, list[str]]:
+    """Options per config group, in the order of the main config's defaults."""
+    folder = config_folder()
+    given = OmegaConf.load(folder / f"{CONFIG}.yaml")
+    named = [str(key) for entry in given.defaults if isinstance(entry, DictConfig) for key in entry]
+    return {name: sorted(path.stem for path in (folder / name).glob("*.yaml")) for name in named}
+
+
+def nearest(name: str, allowed: Sequence[str]) -> str:
+    close = get_close_matches(name, list(allowed), n=1)
+    return f"allowed: {', '.join(allowed)}" + (f" (did you mean {close[0]!r}?)" if close else "")
+
+
+def one_line(text: Any) -> str:
+    return " ".join(str(text).split())
+
+
+# -- reading ---------------------------------------------------------------------------------------
+
+
+def read(arguments: Sequence[str]) -> Command:
+    """Take the command line apart and compose the config of a single run.
+
+    Raises:
+        InputError: an unknown option, a setting that does not exist, a value that no config is named after.
+    """
+    options, overrides = _split(arguments)
+    overrides = [part for text in overrides for part in _own_problem(text)]
+    command = Command(options, overrides, None)
+    if not options:
+        return Command(options, overrides, composed(overrides))
+    if command.multirun:
+        _check(overrides)
+    return command
+
+
+def composed(overrides: Sequence[str], with_hydra: bool = False) -> DictConfig:
+    """The config that overrides make of the main one; values may still be unresolved."""
+    try:
+        return _compose(overrides, with_hydra)
+    except (HydraException, OmegaConfBaseException) as error:
+        _check(overrides)
+        raise InputError(one_line(error)) from error
+
+
+def _compose(overrides: Sequence[str], with_hydra: bool = False) -> DictConfig:
+    with initialize_config_dir(str(config_folder()), job_name="ponn", version_base="1.3"):
+        return compose(CONFIG, list(overrides), return_hydra_config=with_hydra)
+
+
+def _split(arguments: Sequence[str]) -> tuple[list[str], list[str]]:
+    options: list[str] = []
+    overrides: list[str] = []
+    for text in arguments:
+        name = text.partition("=")[0]
+        if text.startswith("-") and not text[1:2].isdigit():
+            if name not in (*SWITCHES, *WITH_VALUE):
+                allowed = [*SWITCHES, *WITH_VALUE, "--help", "--config-groups", "--version"]
+                raise InputError(f"{name}: no such option; {nearest(name, allowed)}")
+            options.append(text)
+        elif options and options[-1] in WITH_VALUE and (text in VALUES or "=" not in text):
+            options.append(text)
+        else:
+            overrides.append(text)
+    return options, overrides
+
+
+def _own_problem(text: str) -> list[str]:
+    """``problem=file.py:function`` as overrides of the config ``problem=custom``; anything else as it is."""
+    key, separator, value = text.partition("=")
+    if key.startswith("problem.arguments."):
+        return [f"++{text}"]
+    reference = value.strip("'\"")
+    if key != "problem" or not separator or ":" not in reference:
+        return [text]
+    function = reference.rpartition(":")[2]
+    if not function.isidentifier():
+        raise InputError(
+            f"problem = {reference!r}; allowed: module:function, file.py:function or a config of the group"
+        )
+    return ["problem=custom", f"problem.reference={_quoted(reference)}", f"problem.name={function}"]
+
+
+def _quoted(text: str) -> str:
+    return "'" + text.replace("\\", "\\\\").replace("'", "\\'") + "'"
+
+
+# -- what is wrong ---------------------------------------------------------------------------------
+
+
+def _check(overrides: Sequence[str]) -> None:
+    """Raise an InputError for the first override that names no setting or no config."""
+    parsed = [_parsed(text) for text in overrides]
+    options, chosen = groups(), []
+    for override in parsed:
+        name = override.key_or_group
+        if name not in options:
+            continue
+        values = _values(override)
+        for value in values:
+            if value is not None and value not in options[name]:
+                extra = ", module:function, file.py:function" if name == "problem" else ""
+                hint = nearest(str(value), options[name])
+                raise InputError(f"{name} = {value!r}; " + hint.replace(" (did", f"{extra} (did", 1))
+        if values:
+            chosen.append(f"{name}={values[0]}" if values[0] is not None else f"{name}=null")
+    base = _compose(chosen, with_hydra=True)
+    for override in parsed:
+        if override.key_or_group not in options and override.type is OverrideType.CHANGE:
+            _check_key(base, override.key_or_group, list(options))
+
+
+def _parsed(text: str) -> Override:
+    try:
+        return OverridesParser.create().parse_override(text)
+    except HydraException:
+        hint = "allowed: key=value, with 'quotes' around special characters"
+        raise InputError(f"{text!r} cannot be read as a setting; {hint}") from None
+
+
+def _values(override: Override) -> list[Any]:
+    """Values of an override, those of a sweep one by one; none for a pattern."""
+    if override.is_sweep_override():
+        return [] if isinstance(override.value(), Glob) else list(override.sweep_iterator())
+    value = override.value()
+    return list(value) if isinstance(value, list) else [value]
+
+
+def _check_key(base: DictConfig, key: str, named: Sequence[str]) -> None:
+    """Walk a dotted key down the config as far as it exists."""
+    node: Any = base
+    place: list[str] = []
+    for part in re.split(r"[.\[]", key):
+        place.append(part)
+        if not isinstance(node, DictConfig):
+            return
+        if part not in node:
+            allowed = [str(entry) for entry in node if str(entry) not in ("hydra", "_target_")]
+            if len(place) == 1:
+                allowed += [name for name in named if name not in allowed and name != "hydra"]
+            raise InputError(f"{'.'.join(place)}: no such setting; {nearest(part, allowed)}")
+        if OmegaConf.is_missing(node, part):
+            return
+        node = node[part] if not OmegaConf.is_interpolation(node, part) else None

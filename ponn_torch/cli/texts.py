@@ -1,0 +1,74 @@
+"""What ``ponn --help``, ``--config-groups`` and ``--version`` say."""
+
+from __future__ import annotations
+
+import textwrap
+from collections.abc import Callable
+from pathlib import Path
+
+from ponn_torch import __version__
+from ponn_torch.cli.overrides import config_folder, groups
+
+USAGE = """\
+ponn: solve an optimal control problem by a Pontryagin neural network, fly the solution and certify it.
+
+  ponn [GROUP=CONFIG ...] [KEY=VALUE ...] [-m]
+
+Examples
+  ponn                                              Earth-Mars transfer from a random start
+  ponn problem=mars_landing seed=3                  another problem, another start
+  ponn problem=mars_landing ansatz=elm_tanh optimizer=lm continuation=tanh_ladder
+  ponn problem=mars_landing problem.final_time=50   other data
+  ponn problem=my_problem.py:my_problem             your own problem (a function that returns one)
+  ponn experiment=ponn_landing_paper                the setting of a paper
+  ponn -m seed=0,1,2,3 record=minimal               a sweep
+  ponn hydra.run.dir=runs/here                      into a folder of your choice
+
+Config groups (GROUP=CONFIG; the first line of each config: ponn --config-groups)
+{groups}
+
+Settings of the chosen configs (KEY=VALUE): ponn --cfg job [GROUP=CONFIG ...]
+Other options: -m sweep over lists of values, --config-groups, --version, --hydra-help
+
+A run leaves in its folder: config.yaml, overrides.yaml, records.jsonl, TensorBoard events, solution/,
+certificate.json, figures/, report.md, environment.json, outcome.json; failure.txt if something went wrong.
+
+Exit code: 0 certified (with refinement=none: finished), 1 bad input, 2 not certified, 3 an error inside,
+130 interrupted.\
+"""
+
+
+def first_comment(path: Path) -> str:
+    """The line that opens a config."""
+    line = path.read_text(encoding="utf-8").partition("\n")[0]
+    return line.removeprefix("#").strip() if line.startswith("#") else ""
+
+
+def _shown_groups() -> dict[str, list[str]]:
+    return {name: options for name, options in groups().items() if name != "hydra" and options}
+
+
+def usage() -> str:
+    lines = []
+    for name, options in _shown_groups().items():
+        text = ", ".join(options)
+        lines.append(textwrap.fill(text, 110, initial_indent=f"  {name:14}", subsequent_indent=" " * 16))
+    return USAGE.format(groups="\n".join(lines))
+
+
+def config_groups() -> str:
+    lines = []
+    for name, options in _shown_groups().items():
+        lines.append(name)
+        lines += [
+            f"  {option:24}{first_comment(config_folder() / name / f'{option}.yaml')}" for option in options
+        ]
+    return "\n".join(lines)
+
+
+TEXTS: dict[str, Callable[[], str]] = {
+    "--help": usage,
+    "-h": usage,
+    "--config-groups": config_groups,
+    "--version": lambda: f"ponn-torch {__version__}",
+}
