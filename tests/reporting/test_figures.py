@@ -40,17 +40,11 @@ def close(left, right):
 
 @pytest.mark.parametrize("kind", SOLVES)
 def test_every_kind_of_problem_gets_the_figures_that_apply(solved, kind, tmp_path):
-    # drawing is slow: the report's tests draw every figure once, here only the one that differs most
     result = solved(kind)
     figures = all_figures(result.solution, result.stages)
     assert set(figures) == APPLY[kind]
-    for name, figure in figures.items():
-        assert isinstance(figure, Figure)
-        if name != "control":
-            continue
-        path = tmp_path / "deeper" / f"{name}.png"
-        save(figure, path, dpi=40)
-        assert path.stat().st_size > 2000
+    assert all(isinstance(figure, Figure) for figure in figures.values())
+    # drawing is slow: the report's tests draw every figure, here the one that has no layout engine
     save(stage_figure(result.solution), tmp_path / "stage.png", dpi=40)
     assert (tmp_path / "stage.png").stat().st_size > 1000
     assert "matplotlib.pyplot" not in sys.modules or not sys.modules["matplotlib.pyplot"].get_fignums()
