@@ -8,6 +8,7 @@ import torch
 
 from ponn_torch.optimal_control.control_laws import ThrustBall, make_regulariser
 from ponn_torch.optimal_control.problem import DisplayUnit, Named, OptimalControlProblem
+from ponn_torch.problems.arguments import check_positive, check_thrust, check_vectors
 from ponn_torch.problems.constants import ASTRONOMICAL_UNIT, DAY, KILOMETRE, STANDARD_GRAVITY, SUN_GM
 from ponn_torch.problems.known import known_optimum
 
@@ -37,6 +38,10 @@ def earth_mars(
 
     ``known_cost`` None takes the known optimum where the data are the published ones.
     """
+    check_vectors(initial_position_km=initial_position_km, initial_velocity_km_s=initial_velocity_km_s)
+    check_vectors(final_position_km=final_position_km, final_velocity_km_s=final_velocity_km_s)
+    check_positive(initial_mass=initial_mass, final_time_days=final_time_days, specific_impulse=specific_impulse)
+    check_thrust(minimum_thrust, maximum_thrust)
     if known_cost is None:
         known_cost = known_optimum(earth_mars, locals(), OPTIMA_KG)
     alpha = 1.0 / (specific_impulse * STANDARD_GRAVITY)  # kg per N s

@@ -9,6 +9,7 @@ import torch
 
 from ponn_torch.optimal_control.control_laws import ThrustBall, make_regulariser
 from ponn_torch.optimal_control.problem import DisplayUnit, FreeTime, Named, OptimalControlProblem
+from ponn_torch.problems.arguments import check_positive, check_thrust, check_vectors
 from ponn_torch.problems.constants import STANDARD_GRAVITY
 from ponn_torch.problems.known import known_optimum
 
@@ -51,6 +52,15 @@ def mars_landing(
     overrides it, as in the TFC paper's rounded 5.0863e-4. ``known_cost`` None takes the known optimum where the
     data are published ones.
     """
+    check_vectors(initial_position=initial_position, initial_velocity=initial_velocity)
+    check_vectors(final_position=final_position, final_velocity=final_velocity)
+    check_positive(initial_mass=initial_mass, final_time=final_time, specific_impulse=specific_impulse)
+    check_positive(standard_gravity=standard_gravity)
+    check_thrust(minimum_thrust, maximum_thrust)
+    if not 0 <= cant_angle_degrees < 90:
+        raise ValueError(f"cant_angle_degrees = {cant_angle_degrees}; allowed: from 0 to below 90")
+    if mass_flow_per_thrust is not None:
+        check_positive(mass_flow_per_thrust=mass_flow_per_thrust)
     if known_cost is None:
         unused = ["final_time"] if free_final_time else []
         unused += ["specific_impulse", "standard_gravity", "cant_angle_degrees"] if mass_flow_per_thrust else []
