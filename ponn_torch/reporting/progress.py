@@ -5,16 +5,17 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Mapping
-
-from rich.console import Console
-from rich.progress import Progress as Bar
-from rich.progress import SpinnerColumn, TextColumn, TimeElapsedColumn
+from typing import TYPE_CHECKING
 
 from ponn_torch.optim.base import Record
 from ponn_torch.reporting.recorder import Recorder
 from ponn_torch.solving.certificate import Certificate
 from ponn_torch.solving.observer import StageResult
 from ponn_torch.solving.solution import Solution
+
+if TYPE_CHECKING:
+    from rich.console import Console
+    from rich.progress import Progress as Bar
 
 REFRESH_SECONDS = 0.2  # drawing a line takes a few ms, an iteration too
 
@@ -27,6 +28,11 @@ class Progress(Recorder):
     """Prints a line per stage; on a terminal also a live line with iteration, residual and cost."""
 
     def __init__(self, console: Console | None = None) -> None:
+        # rich draws from Python's random generator when it is imported, and importing this package must not
+        from rich.console import Console
+        from rich.progress import Progress as Bar
+        from rich.progress import SpinnerColumn, TextColumn, TimeElapsedColumn
+
         self._console = console or Console()
         self._unit, self._shown = "", 0.0
         self._cost = math.nan

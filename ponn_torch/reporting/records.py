@@ -14,8 +14,6 @@ from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any
 
-from rich.console import Console
-
 from ponn_torch.optim.base import Record
 from ponn_torch.reporting.progress import Progress
 from ponn_torch.reporting.recorder import Recorder, finite_or_none, stage_entry
@@ -25,6 +23,8 @@ from ponn_torch.solving.solution import Solution
 
 if TYPE_CHECKING:
     from typing import Self
+
+    from rich.console import Console
 
 RECORDS = "records.jsonl"
 
