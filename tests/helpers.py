@@ -118,7 +118,7 @@ def collocation(
     kind: str = "legendre_gauss",
     conditioning: str = "columns",
 ) -> Collocation:
-    """The residual of a problem on equal segments, at a smoothing where the control is bounded and not curved."""
+    """The residual of a problem on equal segments, at a smoothing where the law knows one."""
     nodes = make_nodes(kind, n_nodes, dtype=torch.float64)
     disc = Discretisation(bvp, basis(n_neurons), nodes, form or Strong(), conditioning)
     times = torch.linspace(0.0, 1.0, n_segments + 1, dtype=torch.float64) * bvp.final_time
