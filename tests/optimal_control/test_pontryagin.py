@@ -7,13 +7,14 @@ from collections.abc import Callable
 
 import pytest
 import torch
+from examples import interception
 from helpers import PROBLEMS, VARIANTS, bvp_of, mass_variables, problem, random, relative
 from torch import Tensor
 from torch.func import grad, jvp
 
-from ponn_torch.optimal_control.control_laws import Box, Regime, Unconstrained
+from ponn_torch.optimal_control.control_laws import Box, Regime
 from ponn_torch.optimal_control.pontryagin import BoundaryValueProblem, Chain, Setting, pontryagin
-from ponn_torch.optimal_control.problem import FreeTime, OptimalControlProblem
+from ponn_torch.optimal_control.problem import OptimalControlProblem
 
 RHO = 0.3
 Rates = dict[str, Tensor]
@@ -330,24 +331,6 @@ def test_mass_variables_start_at_zero_where_they_are_logarithms():
         rates[variable] = bvp.rates(time, bvp.to_scaled(*physical_points(bvp)), setting)[:, 6]
     assert bool((rates["log_mass"] < 0).all())
     torch.testing.assert_close(rates["delta_v"], -rates["log_mass"], rtol=1e-13, atol=0)
-
-
-def interception() -> OptimalControlProblem:
-    """Meet a target at 1 + 2t on the x axis in free time, at a price of the time and of the speed left."""
-    return OptimalControlProblem(
-        name="interception",
-        states={"x": 2, "v": 2},
-        control=Unconstrained("a", 2),
-        dynamics=lambda t, x, u, p: {"x": x.v, "v": u.a},
-        running_cost=lambda t, x, u, p: 0.5 * (u.a**2).sum(-1, keepdim=True),
-        terminal_cost=lambda t, x, p: p.price * t**2 + 3.0 * (x.v**2).sum(-1, keepdim=True),
-        terminal_manifold=lambda t, x, p: torch.cat([x.x[..., :1] - 1.0 - 2.0 * t, x.x[..., 1:]], -1),
-        parameters={"price": 0.5},
-        initial={"x": 0.0, "v": 0.0},
-        final={},
-        final_time=FreeTime(1.5),
-        units={"x": 4.0, "v": 3.0, "time": 2.0, "cost": 5.0},
-    )
 
 
 def test_terminal_rows_by_hand():
