@@ -82,16 +82,15 @@ class ArrowJacobian:
     """K segments with unknowns of their own, coupled by a few shared ones.
 
     Rows: the segments' (K × R), then E extra rows that see shared unknowns only. Columns: the segments' own (K × P),
-    then G shared. Segment k's rows see its own columns through ``local`` (..., K, R, P) and S quantities through
-    ``shared`` (..., K, R, S) that depend linearly on the shared unknowns by ``spread`` (K, S, G): one-hot rows for
-    unknowns, zero rows for what is known, other weights for what lies between. ``extra`` is (..., E, G). Steps and
-    gradients are ordered [segments' own, shared].
+    then G shared. Segment k's rows see its own columns through ``local`` (..., K, R, P) and the shared columns
+    ``index[k]`` (S,) through ``shared`` (..., K, R, S); an index of G means a column that is no unknown.
+    ``extra`` is (..., E, G). Steps and gradients are ordered [segments' own, shared].
     """
 
     local: Tensor
     shared: Tensor
     extra: Tensor
-    spread: Tensor
+    index: Tensor
 
     @property
     def n_shared(self) -> int:
@@ -115,15 +114,26 @@ class ArrowJacobian:
 
     def _gather(self, shared: Tensor) -> Tensor:
         """Shared unknowns (..., G) as the segments see them (..., K, S)."""
-        return torch.einsum("ksg,...g->...ks", self.spread, shared)
+        return torch.cat([shared, torch.zeros_like(shared[..., :1])], -1)[..., self.index]
 
     def _scatter(self, segments: Tensor) -> Tensor:
         """Sum the segments' columns (..., K, S) into (..., G)."""
-        return torch.einsum("ksg,...ks->...g", self.spread, segments)
+        out = segments.new_zeros(*segments.shape[:-2], self.n_shared + 1)
+        return out.index_add_(-1, self.index.flatten(), segments.flatten(-2))[..., :-1]
 
     def _scatter_matrix(self, blocks: Tensor) -> Tensor:
         """Sum (..., K, S, S) into (..., G, G)."""
-        return (self.spread.mT @ blocks @ self.spread).sum(-3)
+        size = self.n_shared + 1
+        place = self.index.unsqueeze(-1) * size + self.index.unsqueeze(-2)
+        out = blocks.new_zeros(*blocks.shape[:-3], size * size)
+        out.index_add_(-1, place.flatten(), blocks.flatten(-3))
+        return out.unflatten(-1, (size, size))[..., :-1, :-1]
+
+    def _spread_columns(self, segments: Tensor) -> Tensor:
+        """Columns (..., K, R, S) in the numbering of the shared unknowns, (..., K, R, G)."""
+        out = segments.new_zeros(*segments.shape[:-1], self.n_shared + 1)
+        index = self.index.unsqueeze(-2).expand(segments.shape)
+        return out.scatter_add_(-1, index, segments)[..., :-1]
 
     def column_norms(self) -> Tensor:
         own, _, shared = self._normal
@@ -148,10 +158,9 @@ class ArrowJacobian:
         k, rows, own = self.local.shape[-3:]
         batch = self.local.shape[:-3]
         out = self.local.new_zeros(*batch, k * rows + self.extra.shape[-2], self.n_own + self.n_shared)
+        out[..., : k * rows, self.n_own :] = self._spread_columns(self.shared).flatten(-3, -2)
         for i in range(k):
-            block = slice(i * rows, (i + 1) * rows)
-            out[..., block, i * own : (i + 1) * own] = self.local[..., i, :, :]
-            out[..., block, self.n_own :] = self.shared[..., i, :, :] @ self.spread[i]
+            out[..., i * rows : (i + 1) * rows, i * own : (i + 1) * own] = self.local[..., i, :, :]
         out[..., k * rows :, self.n_own :] = self.extra
         return out
 
@@ -184,7 +193,7 @@ class ArrowJacobian:
         stacked = torch.cat([self.local, self.shared, segments.unsqueeze(-1)], -1)
         head, tail = _qr_tail(stacked, scale_own, damping, n)
         # what each segment leaves over for the shared unknowns, in their numbering
-        left_over = torch.cat([tail[..., :-1] @ self.spread, tail[..., -1:]], -1).flatten(-3, -2)
+        left_over = torch.cat([self._spread_columns(tail[..., :-1]), tail[..., -1:]], -1).flatten(-3, -2)
         rows = torch.cat([left_over, torch.cat([self.extra, extra.unsqueeze(-1)], -1)], -2)
         step = _back_substitute(_qr_tail(rows, scale_shared, damping[..., 0], g)[0], g).squeeze(-1)
         known = head[..., n:-1] @ self._gather(step).unsqueeze(-1) + head[..., -1:]

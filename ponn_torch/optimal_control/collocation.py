@@ -255,19 +255,19 @@ class Collocation:
         return torch.tensor(free, device=self.known_times.device).nonzero()[:, 0]
 
     @cached_property
-    def time_map(self) -> tuple[Tensor, Tensor]:
-        """(base (..., K+1), map (K+1, F)) with knot times = base + map @ free times."""
-        k, known = self.n_segments, self.known_times
-        anchors = [0, *self.switch_knots, k]
-        first = known.reshape(-1, k + 1)[0].tolist()
-        weights = known.new_zeros(k + 1, k + 1)  # knot times from anchor times
-        for a, b in zip(anchors[:-1], anchors[1:], strict=True):
-            for i in range(a, b + 1):
-                fraction = (first[i] - first[a]) / (first[b] - first[a])
-                weights[i, a], weights[i, b] = 1.0 - fraction, fraction
-        free = self.free_times
-        fixed = [i for i in range(k + 1) if i not in free.tolist()]
-        return (weights[:, fixed] @ known[..., fixed].unsqueeze(-1)).squeeze(-1), weights[:, free]
+    def _anchors(self) -> Tensor:
+        """(2, K+1): the switches or ends that every knot lies between; an anchor lies on itself."""
+        anchors = [0, *self.switch_knots, self.n_segments]
+        before = [max(a for a in anchors if a <= i) for i in range(self.n_segments + 1)]
+        after = [min(a for a in anchors if a >= i) for i in range(self.n_segments + 1)]
+        return torch.tensor([before, after], device=self.known_times.device)
+
+    @cached_property
+    def _fractions(self) -> Tensor:
+        """(K+1,): how far a knot lies from the anchor before it to the one after."""
+        known = self.known_times.reshape(-1, self.n_segments + 1)[0]
+        start, end = known[self._anchors]
+        return torch.where(end > start, (known - start) / (end - start), torch.zeros_like(known))
 
     @property
     def n_weights(self) -> int:
@@ -294,8 +294,11 @@ class Collocation:
         time_end = knot_end + len(self.free_times)
         knots = self.known_knots.flatten(-2).expand(*batch, -1)
         knots = knots.index_copy(-1, self.free_knots, xi[..., self.n_weights : knot_end])
-        base, between = self.time_map
-        times = (base + xi[..., knot_end:time_end] @ between.mT).expand(*batch, -1)
+        anchors = self.known_times.expand(*batch, -1)
+        if len(self.free_times):
+            anchors = anchors.index_copy(-1, self.free_times, xi[..., knot_end:time_end])
+        start, end = self._anchors
+        times = anchors[..., start] + self._fractions * (anchors[..., end] - anchors[..., start])
         return Unknowns(weights, knots.unflatten(-1, (k + 1, self.bvp.dimension)), times, xi[..., time_end:])
 
     def pack(self, unknowns: Unknowns) -> Tensor:
@@ -417,11 +420,13 @@ class Collocation:
             if not group.trivial:
                 by_start = -scale[..., None] * slopes_t[..., here].mT
             # h = (t₁ − t₀)/2 and t = t₀ + h (z + 1): what depends on t apart from h moves with t₀
-            ends = torch.stack([by_start - 0.5 * motion, 0.5 * motion], -1)
-            rows.copy_((group.test @ ends).flatten(-3, -2))
+            by_start, by_end = by_start - 0.5 * motion, 0.5 * motion
+            f, g = (fraction[:, None, None] for fraction in self._end_fractions)
+            anchors = torch.stack([(1 - f) * by_start + (1 - g) * by_end, f * by_start + g * by_end], -1)
+            rows.copy_((group.test @ anchors).flatten(-3, -2))
         extra_value, extra = self._extra_linearised(unknowns)
         residual = torch.cat([equations.flatten(-2), extra_value], -1)
-        return residual, ArrowJacobian(local, shared, extra, self._spread)
+        return residual, ArrowJacobian(local, shared, extra, self._shared_index)
 
     def _rates_and_slopes(self, t: Tensor, w: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """F (..., 2n) and, for the equations in use, ∂F/∂t (..., rows) and ∂F/∂w (..., rows, 2n)."""
@@ -526,15 +531,29 @@ class Collocation:
                 shared[..., group.rows, index] = by_knot.flatten(-4, -3).flatten(-2)
 
     @cached_property
-    def _spread(self) -> Tensor:
-        """(K, S, G): a segment's [left knot, right knot, t₀, t₁] from the shared unknowns, as far as they depend on them."""
-        k, width, n_knots = self.n_segments, self.bvp.dimension, len(self.free_knots)
-        knots = self.known_times.new_zeros((k + 1) * width, self.n_shared)
-        knots[self.free_knots, torch.arange(n_knots, device=knots.device)] = 1.0
-        knots = knots.view(k + 1, width, self.n_shared)
-        times = self.known_times.new_zeros(k + 1, self.n_shared)
-        times[:, n_knots : n_knots + len(self.free_times)] = self.time_map[1]
-        return torch.cat([knots[:-1], knots[1:], times[:-1, None], times[1:, None]], -2)
+    def _shared_index(self) -> Tensor:
+        """(K, S): where a segment's [left knot, right knot, anchor before, anchor after] stand among the shared unknowns."""
+        k, width, device = self.n_segments, self.bvp.dimension, self.known_times.device
+        n_knots, n_times = len(self.free_knots), len(self.free_times)
+        knots = torch.full(((k + 1) * width,), self.n_shared, device=device)
+        knots[self.free_knots] = torch.arange(n_knots, device=device)
+        knots = knots.view(k + 1, width)
+        times = torch.full((k + 1,), self.n_shared, device=device)
+        times[self.free_times] = n_knots + torch.arange(n_times, device=device)
+        start, end = self._segment_anchors
+        return torch.cat([knots[:-1], knots[1:], times[start, None], times[end, None]], -1)
+
+    @property
+    def _segment_anchors(self) -> tuple[Tensor, Tensor]:
+        """Anchors (K,) before and after every segment."""
+        return self._anchors[0, :-1], self._anchors[1, 1:]
+
+    @cached_property
+    def _end_fractions(self) -> tuple[Tensor, Tensor]:
+        """How far the two ends of every segment (K,) lie between its anchors."""
+        fractions = self._fractions
+        # the end of a segment that is an anchor is the anchor after it, not the one before the next
+        return fractions[:-1], torch.where(self._anchors[1, 1:] == self._anchors[0, 1:], torch.ones_like(fractions[1:]), fractions[1:])
 
     # -- rows that see knots, times and multipliers only ----------------------------------------------------------------
 
@@ -576,7 +595,7 @@ class Collocation:
         jacobian = torch.cat(
             [
                 by_knots.flatten(-2)[..., self.free_knots],
-                by_times @ self.time_map[1],
+                by_times[..., self.free_times],
                 by_multipliers,
             ],
             -1,

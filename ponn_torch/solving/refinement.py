@@ -1,9 +1,10 @@
-"""Refinement at the switches: the domain is split there and everything is solved in one least squares.
+"""Refinement: small segments, halved where the residual between the nodes is too large, and switches found exactly.
 
-Coefficients, knot values, switch times and a free final time are unknowns of the same residual, the control sits at its
-bound inside every arc (no smoothing is left), and rows S(t_k) = 0 fix the switch times; both papers name this as
-future work. The sign of S is then checked on a fine grid, and where the minimum principle asks for other arcs these
-are tried: a solved residual with the wrong arcs is an extremal of nothing.
+``Split`` cuts the domain at the switches and solves for everything in one least squares: coefficients, knot values,
+switch times and a free final time, with rows S(t_k) = 0 and the control at its bound inside every arc (no smoothing is
+left). Both papers name this as future work. The sign of S is then checked on a fine grid, and where the minimum principle
+asks for other arcs these are tried: a solved residual with the wrong arcs is an extremal of nothing. ``Subdivide`` keeps
+the regime of the curve it is given, so that a smoothed problem is solved to the end as a problem of its own.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from enum import Enum
+from typing import Protocol
 
 import torch
 from torch import Tensor
@@ -22,45 +24,51 @@ from ponn_torch.optim.least_squares import LevenbergMarquardt
 from ponn_torch.optimal_control.collocation import Collocation, Discretisation
 from ponn_torch.optimal_control.control_laws import Regime
 from ponn_torch.optimal_control.curve import Curve
-from ponn_torch.optimal_control.pontryagin import Setting
+from ponn_torch.optimal_control.pontryagin import BoundaryValueProblem, Setting
 from ponn_torch.solving.guess import project
 from ponn_torch.solving.switching import Structure, find_structure, without_short_arcs
 
+MakeCallback = Callable[[Collocation], Callback]
 
-class SplitStatus(Enum):
-    """How a split ended; the value is the message."""
 
-    CONSISTENT = "the residual is solved and every arc is the one that the sign of S asks for"
-    RESIDUAL = "the residual of the split problem did not fall below its tolerance"
+class Outcome(Enum):
+    """How a refinement ended; the value is the message."""
+
+    SOLVED = "solved on every segment, between the nodes too, and every arc is the one that S asks for"
+    RESIDUAL = "the residual did not fall below its tolerance"
     STRUCTURE = "the arcs and the sign of S still disagreed after the last round"
-    COARSE = "the arcs are right, but the residual between the nodes is above its tolerance"
-    TOO_MANY_ARCS = "the sign of S asks for more arcs than allowed: a singular arc, or a curve that is no solution"
+    COARSE = "the residual between the nodes stayed above its tolerance"
+    TOO_MANY_ARCS = "S asks for more arcs than allowed: a singular arc, or a curve that is no solution"
+    TOO_MANY_SEGMENTS = "more segments were needed than allowed"
+    INTERRUPTED = "interrupted from the keyboard"
 
 
 @dataclass(frozen=True)
-class SplitResult:
-    """Best curve found, its arcs, how it ended, and every round's optimiser result with the arcs it was given."""
+class Refined:
+    """The last curve, how the refinement ended, and every round's optimiser result."""
 
     curve: Curve
-    structure: Structure
-    status: SplitStatus
-    rounds: list[tuple[Structure, OptimizeResult]]
+    outcome: Outcome
+    rounds: list[OptimizeResult]
+
+
+class Refinement(Protocol):
+    def run(self, start: Curve, callback: MakeCallback | None = None) -> Refined:
+        """Refine a curve; never raises for want of convergence, the outcome says how it ended."""
+        ...
 
 
 @dataclass(frozen=True)
-class Split:
-    """Solve between switches until arcs and S agree and the equations hold between the nodes.
+class Segmentation:
+    """What refinements share: small segments of one size, and the solver of a round.
 
-    Every arc is one or more segments with the same few neurons; a segment whose off-node residual is too large is halved.
     Small blocks are what makes it fast: the arrow elimination costs n_segments × n_neurons³.
 
     Attributes:
-        n_neurons, n_nodes: size of a segment.
-        n_segments: number of segments that the first round spreads over the arcs, by their duration.
+        n_neurons, n_nodes: size of a segment. n_segments: how many the first round has, about.
         basis: the free function of a segment (Legendre by default).
         residual_tolerance: ‖r‖ above which a round has failed.
         off_node_tolerance: largest |ẇ − F| off the nodes, scaled.
-        short_arc: arcs shorter than this fraction of the final time in a failed round are merged away.
     """
 
     n_neurons: int = 14
@@ -68,10 +76,8 @@ class Split:
     n_segments: int = 8
     max_segments: int = 128
     max_rounds: int = 8
-    max_arcs: int = 40
     residual_tolerance: float = 1e-6
     off_node_tolerance: float = 1e-9
-    short_arc: float = 1e-3
     stopping: Stopping = field(
         default_factory=lambda: Stopping(tolerance=1e-13, decrease=1e-2, patience=2, max_iterations=40)
     )
@@ -79,57 +85,137 @@ class Split:
     linear_solver: str = "cholesky"
     basis: Callable[[int], LinearBasis] = Legendre
 
-    def run(self, start: Curve, callback: Callable[[Collocation], Callback] | None = None) -> SplitResult:
-        """Refine a smoothed curve; never raises for want of convergence, the status says how it ended.
-
-        ``callback`` makes an iteration callback for the residual of a round.
-        """
-        bvp, rounds = start.collocation.bvp, []
+    def discretisation(self, bvp: BoundaryValueProblem) -> Discretisation:
         nodes = make_nodes("legendre_gauss", self.n_nodes, dtype=bvp.unit.dtype, device=bvp.unit.device)
-        disc = Discretisation(bvp, self.basis(self.n_neurons), nodes, conditioning="orthonormal")
-        curve, status = start, SplitStatus.STRUCTURE
-        structure = find_structure(start)
-        knots, events, arcs = _spread_segments(structure, start.times, self.n_segments)
+        return Discretisation(bvp, self.basis(self.n_neurons), nodes, conditioning="orthonormal")
+
+    def solve(self, collocation: Collocation, start: Curve, callback: MakeCallback | None) -> tuple[Curve, OptimizeResult]:
+        """One round, from the projection of ``start``."""
+        optimizer = LevenbergMarquardt(self.stopping, damping=self.damping, linear_solver=self.linear_solver)
+        on_iteration = callback(collocation) if callback else None
+        result = optimizer.run(collocation, project(collocation, start), on_iteration)
+        return Curve(collocation, result.xi), result
+
+    def solved(self, result: OptimizeResult) -> bool:
+        return float(result.norm) < self.residual_tolerance
+
+
+@dataclass(frozen=True)
+class Subdivide(Segmentation):
+    """Solve the curve's own regime on fixed segments, halved until the equations hold between the nodes.
+
+    A first round that fails is tried again with twice the segments.
+    """
+
+    def run(self, start: Curve, callback: MakeCallback | None = None) -> Refined:
+        bvp, setting, rounds = start.collocation.bvp, start.collocation.setting, []
+        disc = self.discretisation(bvp)
+        ends = start.times[[0, -1]]
+        times = torch.linspace(0, 1, self.n_segments + 1, dtype=ends.dtype, device=ends.device) * ends[1]
+        curve, outcome = start, Outcome.COARSE
         for _ in range(self.max_rounds):
-            if len(structure) > self.max_arcs or len(knots) > self.max_segments:
-                return SplitResult(curve, structure, SplitStatus.TOO_MANY_ARCS, rounds)
-            regime = Regime(arcs=arcs if bvp.law.n_switching else None)
-            setting = Setting(regime, start.collocation.setting.parameters)
-            collocation = Collocation.on_segments(disc, knots, events=events, setting=setting)
-            optimizer = LevenbergMarquardt(self.stopping, damping=self.damping, linear_solver=self.linear_solver)
-            on_iteration = callback(collocation) if callback else None
-            result = optimizer.run(collocation, project(collocation, curve), on_iteration)
-            rounds.append((structure, result))
-            solved = Curve(collocation, result.xi)
+            if len(times) > self.max_segments:
+                return Refined(curve, Outcome.TOO_MANY_SEGMENTS, rounds)
+            solution, result = self.solve(Collocation.on_segments(disc, times, setting=setting), curve, callback)
+            rounds.append(result)
             if result.status is Status.INTERRUPTED:
-                return SplitResult(solved, structure, SplitStatus.RESIDUAL, rounds)
-            if not float(result.norm) < self.residual_tolerance:
-                status = SplitStatus.RESIDUAL
-                repaired = without_short_arcs(structure, solved.times[[0, *collocation.switch_knots, -1]], self.short_arc)
+                return Refined(solution, Outcome.INTERRUPTED, rounds)
+            if self.solved(result):
+                curve, outcome = solution, Outcome.COARSE
+                coarse = curve.off_node_residuals() > self.off_node_tolerance
+                if not bool(coarse.any()):
+                    return Refined(curve, Outcome.SOLVED, rounds)
+            else:
+                outcome, coarse = Outcome.RESIDUAL, solution.off_node_residuals() > self.off_node_tolerance
+            middles = 0.5 * (solution.times[:-1] + solution.times[1:])
+            times = torch.cat([solution.times, middles[coarse]]).sort().values
+        return Refined(curve, outcome, rounds)
+
+
+@dataclass(frozen=True)
+class Split(Segmentation):
+    """Solve between switches until arcs and S agree and the equations hold between the nodes.
+
+    Every arc is one or more segments; those that subdivide it sit at fixed fractions between its switches.
+
+    Attributes:
+        max_arcs: more arcs than this are taken for a sign of a singular arc.
+        short_arc: arcs shorter than this fraction of the final time in a failed round are merged away.
+    """
+
+    max_arcs: int = 40
+    short_arc: float = 1e-3
+
+    def run(self, start: Curve, callback: MakeCallback | None = None) -> Refined:
+        bvp, rounds = start.collocation.bvp, []
+        disc = self.discretisation(bvp)
+        parameters = start.collocation.setting.parameters
+        curve, outcome = start, Outcome.STRUCTURE
+        structure = find_structure(start)
+        segments = _spread(structure, start.times, self.n_segments)
+        for _ in range(self.max_rounds):
+            if len(structure) > self.max_arcs:
+                return Refined(curve, Outcome.TOO_MANY_ARCS, rounds)
+            if len(segments.arcs) > self.max_segments:
+                return Refined(curve, Outcome.TOO_MANY_SEGMENTS, rounds)
+            regime = Regime(arcs=segments.arcs if bvp.law.n_switching else None)
+            collocation = Collocation.on_segments(
+                disc, segments.times, events=segments.events, setting=Setting(regime, parameters)
+            )
+            solution, result = self.solve(collocation, curve, callback)
+            rounds.append(result)
+            if result.status is Status.INTERRUPTED:
+                return Refined(solution, Outcome.INTERRUPTED, rounds)
+            if not self.solved(result):
+                outcome = Outcome.RESIDUAL
+                ends = solution.times[[0, *collocation.switch_knots, -1]]
+                repaired = without_short_arcs(structure, ends, self.short_arc)
                 if repaired.same_arcs(structure):
-                    # too few neurons look the same as a wrong structure: twice the segments, from the same start
-                    knots, events, arcs = _halved(knots, events, arcs)
+                    # too few neurons look the same as wrong arcs: more segments, from the same start
+                    segments = segments.halved()
                 else:
-                    curve, structure = solved, repaired
-                    knots, events, arcs = _spread_segments(structure, solved.times, self.n_segments)
+                    curve, structure = solution, repaired
+                    segments = _spread(structure, solution.times, self.n_segments)
                 continue
-            curve, found = solved, find_structure(solved)
+            curve, found = solution, find_structure(solution)
             if not found.same_arcs(structure):
-                status, structure = SplitStatus.STRUCTURE, found
-                knots, events, arcs = _spread_segments(found, solved.times, self.n_segments)
+                outcome, structure = Outcome.STRUCTURE, found
+                segments = _spread(found, solution.times, self.n_segments)
                 continue
-            coarse = solved.off_node_residuals() > self.off_node_tolerance
+            coarse = solution.off_node_residuals() > self.off_node_tolerance
             if not bool(coarse.any()):
-                return SplitResult(curve, structure, SplitStatus.CONSISTENT, rounds)
-            status = SplitStatus.COARSE
-            knots, events, arcs = _halved(solved.times, events, arcs, coarse)
-        return SplitResult(curve, structure, status, rounds)
+                return Refined(curve, Outcome.SOLVED, rounds)
+            outcome = Outcome.COARSE
+            segments = Segments(solution.times, segments.events, segments.arcs).halved(coarse)
+        return Refined(curve, outcome, rounds)
 
 
-Segments = tuple[Tensor, tuple[int | None, ...], Tensor]  # knot times (K+1,), events (K−1), arc codes (K, m)
+@dataclass(frozen=True)
+class Segments:
+    """Knot times (K+1,), the event of every interior knot or None where it only subdivides, arc codes (K, m)."""
+
+    times: Tensor
+    events: tuple[int | None, ...]
+    arcs: Tensor
+
+    def halved(self, which: Tensor | None = None) -> Segments:
+        """Cut the chosen segments (K,) in two; all of them if None."""
+        k = len(self.arcs)
+        chosen = [True] * k if which is None else which.tolist()
+        times, events, codes = [self.times[0]], [], []
+        for i in range(k):
+            if chosen[i]:
+                times.append(0.5 * (self.times[i] + self.times[i + 1]))
+                events.append(None)
+                codes.append(self.arcs[i])
+            times.append(self.times[i + 1])
+            codes.append(self.arcs[i])
+            if i + 1 < k:
+                events.append(self.events[i])
+        return Segments(torch.stack(times), tuple(events), torch.stack(codes))
 
 
-def _spread_segments(structure: Structure, times: Tensor, n_segments: int) -> Segments:
+def _spread(structure: Structure, times: Tensor, n_segments: int) -> Segments:
     """Cut every arc into equal segments, about n_segments in all, more where an arc is longer."""
     ends = torch.cat([times[:1], structure.times, times[-1:]])
     share = (ends[1:] - ends[:-1]) / (ends[-1] - ends[0]) * n_segments
@@ -140,23 +226,4 @@ def _spread_segments(structure: Structure, times: Tensor, n_segments: int) -> Se
         knots.append(ends[i] + steps * (ends[i + 1] - ends[i]))
         events += [None] * (count - 1) + ([structure.events[i]] if i + 1 < len(counts) else [])
         codes += [structure.arcs[i]] * count
-    return torch.cat(knots), tuple(events), torch.stack(codes)
-
-
-def _halved(
-    times: Tensor, events: tuple[int | None, ...], arcs: Tensor, which: Tensor | None = None
-) -> Segments:
-    """Cut the chosen segments (K,) in two; all of them if None."""
-    k = len(arcs)
-    chosen = [True] * k if which is None else which.tolist()
-    knots, between, codes = [times[0]], [], []
-    for i in range(k):
-        if chosen[i]:
-            knots.append(0.5 * (times[i] + times[i + 1]))
-            between.append(None)
-            codes.append(arcs[i])
-        knots.append(times[i + 1])
-        codes.append(arcs[i])
-        if i + 1 < k:
-            between.append(events[i])
-    return torch.stack(knots), tuple(between), torch.stack(codes)
+    return Segments(torch.cat(knots), tuple(events), torch.stack(codes))

@@ -23,8 +23,9 @@ from ponn_torch.optimal_control.problem import OptimalControlProblem
 from ponn_torch.solving.certificate import Certificate, Tolerances, certify
 from ponn_torch.solving.continuation import Ladder, Outcome, Schedule
 from ponn_torch.solving.guess import Guess, RandomGuess, project
+from ponn_torch.solving import refinement as refinements
 from ponn_torch.solving.observer import Observer, SilentObserver, StageResult
-from ponn_torch.solving.refinement import Split, SplitStatus
+from ponn_torch.solving.refinement import Refinement, Split
 from ponn_torch.solving.solution import Solution
 
 
@@ -74,7 +75,7 @@ class Solver:
     n_segments: int = 1
     optimizer: Optimizer = field(default_factory=_default_optimizer)
     continuation: Schedule = field(default_factory=lambda: Ladder((1.0, 0.3, 0.1, 0.03, 0.01)))
-    refinement: Split | None = field(default_factory=Split)
+    refinement: Refinement | None = field(default_factory=Split)
     guess: Guess = field(default_factory=RandomGuess)
     n_starts: int = 10
     n_certified: int = 1
@@ -134,7 +135,9 @@ class _Run:
                 n_certified += judged.certified
                 if best is None or _better(judged, best[1]):
                     best, message = (candidate, judged), note or judged.verdict
-                if n_certified == self.solver.n_certified:
+                # unrefined, a start that came through its stages is the answer, certified or not
+                enough = 1 if self.solver.refinement is None else n_certified
+                if enough >= self.solver.n_certified:
                     break
         except _Interrupted:
             interrupted, message = True, "interrupted; the best stage so far is kept"
@@ -228,23 +231,23 @@ class _Run:
     # -- refinement ---------------------------------------------------------------------------------------------------
 
     def _refined(self, smoothed: Solution) -> tuple[Solution, str]:
-        """The split solution where it is consistent, else the smoothed one and why."""
-        split = self.solver.refinement
-        if split is None:
+        """The refined solution where the refinement succeeds, else the smoothed one and why."""
+        refinement = self.solver.refinement
+        if refinement is None:
             return smoothed, ""
-        self.observer.stage_started("split", None, len(self.stages))
-        outcome = split.run(smoothed.curve, self._callback)
-        if not outcome.rounds:
-            return smoothed, outcome.status.value
-        for _, result in outcome.rounds[:-1]:
-            self._stage("split", None, result, float("nan"), float("nan"), None)
-        _, result = outcome.rounds[-1]
-        if result.status is Status.INTERRUPTED:
+        name = type(refinement).__name__.lower()
+        self.observer.stage_started(name, None, len(self.stages))
+        refined = refinement.run(smoothed.curve, self._callback)
+        if not refined.rounds:
+            return smoothed, refined.outcome.value
+        for result in refined.rounds[:-1]:
+            self._stage(name, None, result, float("nan"), float("nan"), None)
+        solution = self._record(name, refined.curve, refined.rounds[-1])
+        if refined.outcome is refinements.Outcome.INTERRUPTED:
             raise _Interrupted
-        solution = self._record("split", outcome.curve, result)
-        if outcome.status is SplitStatus.CONSISTENT:
+        if refined.outcome is refinements.Outcome.SOLVED:
             return solution, ""
-        return smoothed, f"split: {outcome.status.value}"
+        return smoothed, f"{name}: {refined.outcome.value}"
 
     # -- bookkeeping -----------------------------------------------------------------------------------------------------
 
