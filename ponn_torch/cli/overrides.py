@@ -88,7 +88,7 @@ def composed(overrides: Sequence[str], with_hydra: bool = False) -> DictConfig:
     """The config that overrides make of the main one; values may still be unresolved."""
     try:
         return _compose(overrides, with_hydra)
-    except (HydraException, OmegaConfBaseException) as error:
+    except (HydraException, OmegaConfBaseException, ValueError) as error:
         _check(overrides)
         raise InputError(one_line(error)) from error
 
@@ -148,12 +148,12 @@ def _check(overrides: Sequence[str]) -> None:
             continue
         values = _values(override)
         for value in values:
-            if value is not None and value not in options[name]:
+            if value not in options[name]:
                 extra = ", module:function, file.py:function" if name == "problem" else ""
                 hint = nearest(str(value), options[name])
                 raise InputError(f"{name} = {value!r}; " + hint.replace(" (did", f"{extra} (did", 1))
         if values:
-            chosen.append(f"{name}={values[0]}" if values[0] is not None else f"{name}=null")
+            chosen.append(f"{name}={values[0]}")
     base = _compose(chosen, with_hydra=True)
     for override in parsed:
         if override.key_or_group not in options and override.type is OverrideType.CHANGE:

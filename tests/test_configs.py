@@ -1,0 +1,162 @@
+"""Every config: it builds, it says what it is, it holds every setting, and it solves with a tiny budget."""
+
+import inspect
+import json
+from dataclasses import fields
+from pathlib import Path
+
+import pytest
+from hydra import compose, initialize_config_dir
+from omegaconf import DictConfig, OmegaConf
+
+from ponn_torch.ansatz.basis import LinearBasis
+from ponn_torch.build import Plan, build
+from ponn_torch.cli import main
+from ponn_torch.optimal_control.problem import FreeTime
+from ponn_torch.settings import ROOMS, target
+from ponn_torch.solving.solver import Solver
+
+CONFIGS = Path(__file__).resolve().parents[1] / "configs"
+OPTIONS = sorted(
+    (path.parent.name, path.stem) for path in CONFIGS.glob("*/*.yaml") if path.parent.name != "hydra"
+)
+REFERENCE = "problem.reference='ponn_torch.problems.mars_landing:mars_landing'"
+
+
+def overrides_of(group: str, option: str) -> list[str]:
+    return [f"{group}={option}", *([REFERENCE] if option == "custom" else [])]
+
+
+def composed(overrides: list[str]) -> DictConfig:
+    with initialize_config_dir(str(CONFIGS), version_base="1.3"):
+        return compose("solve", overrides)
+
+
+def built(*overrides: str) -> Plan:
+    return build(composed(list(overrides)))
+
+
+def test_the_glob_sees_every_group() -> None:
+    groups = {group for group, _ in OPTIONS}
+    assert groups == {path.name for path in CONFIGS.iterdir() if path.is_dir()} - {"hydra"}
+    assert {"problem", "ansatz", "nodes", "optimizer", "continuation", "record", "experiment"} <= groups
+
+
+@pytest.mark.parametrize(("group", "option"), OPTIONS)
+def test_config_builds_and_opens_with_what_it_is(group: str, option: str) -> None:
+    built(*overrides_of(group, option))
+    lines = (CONFIGS / group / f"{option}.yaml").read_text(encoding="utf-8").splitlines()
+    text = next(line for line in lines if not line.startswith("# @package"))
+    assert text.startswith("# ")
+    assert len(text) < 120
+
+
+def test_defaults_are_those_of_the_solver() -> None:
+    solver, default = built().solver, Solver()
+    for item in fields(Solver):
+        given, meant = getattr(solver, item.name), getattr(default, item.name)
+        if isinstance(meant, LinearBasis):
+            assert (type(given), given.arguments) == (type(meant), meant.arguments)
+        elif item.name == "continuation":
+            assert list(given.values) == list(meant.values)
+        else:
+            assert given == meant, item.name
+
+
+def calls(node: object) -> list[dict[str, object]]:
+    """Every node with a ``_target_``."""
+    if isinstance(node, list):
+        return [found for entry in node for found in calls(entry)]
+    if not isinstance(node, dict):
+        return []
+    below = [found for entry in node.values() for found in calls(entry)]
+    return [node, *below] if "_target_" in node else below
+
+
+WITHOUT_CONFIG = {"dtype", "device", "form", "basis", "smallest_damping", "largest_damping"}
+
+
+@pytest.mark.parametrize(
+    ("group", "option"), [pair for pair in OPTIONS if pair[0] not in ("experiment", "continuation")]
+)
+def test_config_holds_every_setting_of_what_it_calls(group: str, option: str) -> None:
+    config = OmegaConf.to_container(composed(overrides_of(group, option)))
+    assert isinstance(config, dict)
+    for node in calls(config[group]) if config.get(group) else []:
+        parameters = inspect.signature(target(node["_target_"], "_target_", ROOMS)).parameters
+        assert set(parameters) - set(node) <= WITHOUT_CONFIG
+
+
+# The known optimum is looked up by data, so that it vanishes with them.
+@pytest.mark.parametrize(
+    ("problem", "cost", "free"),
+    [
+        ("earth_mars", 396.05984393, False),
+        ("mars_landing", 268.0146563274, False),
+        ("mars_landing_g981", 267.9318584923, False),
+        ("tfc_test_1", 179.4476468458, True),
+        ("tfc_test_2", 275.2062387119, True),
+    ],
+)
+def test_known_optimum_belongs_to_the_published_data(problem: str, cost: float, free: bool) -> None:
+    found = built(f"problem={problem}").problem
+    assert (found.name, found.known_cost) == (problem, cost)
+    assert isinstance(found.final_time, FreeTime) is free
+    assert built(f"problem={problem}", "problem.regulariser=quadratic").problem.known_cost == cost
+    assert built(f"problem={problem}", "problem.initial_mass=1500").problem.known_cost is None
+    assert built(f"problem={problem}", "problem.initial_mass=1500", "problem.known_cost=3").problem.known_cost == 3
+
+
+TINY = [
+    "n_starts=1",
+    "start_limit=1e9",
+    "ansatz=legendre",
+    "ansatz.size=8",
+    "nodes.n_nodes=16",
+    "optimizer.stopping.max_iterations=2",
+    "problem=mars_landing",
+    "continuation=single",
+    "refinement=none",
+    "record=minimal",
+]
+# What stands in the way of a tiny budget, per group or option.
+INSTEAD = {
+    "ansatz": ["ansatz.size=8"],
+    "rbf": ["ansatz.centres=8"],
+    "optimizer": ["optimizer.stopping.max_iterations=2"],
+    "record": [],
+    "refinement": [],
+    "tanh_ladder": ["continuation.count=2"],
+    "weak_ladder": ["continuation.phases.1.count=2"],
+    "ladder": ["continuation.values=[1.0,0.1]"],
+    "polar": ["problem=earth_mars"],
+    "split": ["refinement.max_rounds=1", "refinement.stopping.max_iterations=2"],
+    "subdivide": ["refinement.max_rounds=1", "refinement.stopping.max_iterations=2"],
+    "custom": [REFERENCE],
+}
+
+
+def tiny(group: str, option: str) -> list[str]:
+    """Overrides for a run of this config that takes a moment."""
+    chosen = {text.split("=")[0]: text for text in TINY}
+    if group == "experiment":
+        # an experiment chooses its own problem, ladder and sizes
+        for key in ("problem", "ansatz", "ansatz.size", "nodes.n_nodes", "continuation", "refinement"):
+            chosen.pop(key, None)
+        chosen |= {"continuation": "continuation=single", "sizes": "ansatz.size=8", "nodes.n_nodes": "nodes.n_nodes=16"}
+    elif group == "ansatz":
+        chosen.pop("ansatz.size")
+    for text in [f"{group}={option}", *INSTEAD.get(group, []), *INSTEAD.get(option, [])]:
+        if not (option == "rbf" and text == "ansatz.size=8") and not (option == "none" and "max_rounds" in text):
+            chosen[text.split("=")[0]] = text
+    return list(chosen.values())
+
+
+@pytest.mark.parametrize(("group", "option"), OPTIONS)
+def test_config_solves_with_a_tiny_budget(group: str, option: str, tmp_path: Path) -> None:
+    code = main([*tiny(group, option), f"hydra.run.dir='{tmp_path}'"])
+    outcome = json.loads((tmp_path / "outcome.json").read_text(encoding="utf-8"))
+    assert code == outcome["exit_code"]
+    assert code in (0, 2), outcome["message"]
+    assert outcome["cost"] > 0
+    assert (tmp_path / "solution" / "solution.json").is_file()
