@@ -2,6 +2,7 @@
 
 import inspect
 import json
+import math
 from dataclasses import fields
 from pathlib import Path
 
@@ -11,9 +12,11 @@ from omegaconf import DictConfig, OmegaConf
 
 from ponn_torch.ansatz.basis import LinearBasis
 from ponn_torch.build import Plan, build
-from ponn_torch.cli import main
+from ponn_torch.cli.run import run
 from ponn_torch.optimal_control.problem import FreeTime
 from ponn_torch.settings import ROOMS, target
+from ponn_torch.solving import solver as solver_module
+from ponn_torch.solving.certificate import Certificate
 from ponn_torch.solving.solver import Solver
 
 CONFIGS = Path(__file__).resolve().parents[1] / "configs"
@@ -104,7 +107,10 @@ def test_known_optimum_belongs_to_the_published_data(problem: str, cost: float, 
     assert isinstance(found.final_time, FreeTime) is free
     assert built(f"problem={problem}", "problem.regulariser=quadratic").problem.known_cost == cost
     assert built(f"problem={problem}", "problem.initial_mass=1500").problem.known_cost is None
-    assert built(f"problem={problem}", "problem.initial_mass=1500", "problem.known_cost=3").problem.known_cost == 3
+    assert (
+        built(f"problem={problem}", "problem.initial_mass=1500", "problem.known_cost=3").problem.known_cost
+        == 3
+    )
 
 
 TINY = [
@@ -124,7 +130,7 @@ INSTEAD = {
     "ansatz": ["ansatz.size=8"],
     "rbf": ["ansatz.centres=8"],
     "optimizer": ["optimizer.stopping.max_iterations=2"],
-    "record": [],
+    "quiet": ["record.figures=false", "record.tensorboard=false"],
     "refinement": [],
     "tanh_ladder": ["continuation.count=2"],
     "weak_ladder": ["continuation.phases.1.count=2"],
@@ -143,20 +149,35 @@ def tiny(group: str, option: str) -> list[str]:
         # an experiment chooses its own problem, ladder and sizes
         for key in ("problem", "ansatz", "ansatz.size", "nodes.n_nodes", "continuation", "refinement"):
             chosen.pop(key, None)
-        chosen |= {"continuation": "continuation=single", "sizes": "ansatz.size=8", "nodes.n_nodes": "nodes.n_nodes=16"}
+        chosen |= {"continuation": "continuation=single", "nodes.n_nodes": "nodes.n_nodes=16"}
+        chosen["ansatz.size"] = "ansatz.size=8"
     elif group == "ansatz":
         chosen.pop("ansatz.size")
     for text in [f"{group}={option}", *INSTEAD.get(group, []), *INSTEAD.get(option, [])]:
-        if not (option == "rbf" and text == "ansatz.size=8") and not (option == "none" and "max_rounds" in text):
+        absent = {"rbf": "ansatz.size", "none": "refinement.max_rounds"}.get(option)
+        if text.split("=")[0] != absent:
             chosen[text.split("=")[0]] = text
     return list(chosen.values())
 
 
+@pytest.fixture(scope="module")
+def certificate(tmp_path_factory: pytest.TempPathFactory) -> Certificate:
+    """Of a tiny run: no config changes how a solution is judged, and flying takes longer than these runs."""
+    folder = tmp_path_factory.mktemp("judged")
+    run(composed(tiny("problem", "mars_landing")), folder, [])
+    return Certificate.from_dict(json.loads((folder / "certificate.json").read_text(encoding="utf-8")))
+
+
 @pytest.mark.parametrize(("group", "option"), OPTIONS)
-def test_config_solves_with_a_tiny_budget(group: str, option: str, tmp_path: Path) -> None:
-    code = main([*tiny(group, option), f"hydra.run.dir='{tmp_path}'"])
-    outcome = json.loads((tmp_path / "outcome.json").read_text(encoding="utf-8"))
-    assert code == outcome["exit_code"]
-    assert code in (0, 2), outcome["message"]
-    assert outcome["cost"] > 0
+def test_config_solves_with_a_tiny_budget(
+    group: str, option: str, certificate: Certificate, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(solver_module, "certify", lambda *_: certificate)
+    outcome = run(composed(tiny(group, option)), tmp_path, tiny(group, option))
+    assert outcome.exit_code in (0, 2), outcome.message
+    assert outcome.cost is not None
+    assert outcome.cost > 0
+    assert not outcome.certified
+    assert outcome.score == math.inf
     assert (tmp_path / "solution" / "solution.json").is_file()
+    assert (tmp_path / "figures" / "control.png").is_file() is (option == "default")

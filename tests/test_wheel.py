@@ -1,5 +1,6 @@
 """The wheel carries the configs and runs from another folder, without the source tree."""
 
+import json
 import os
 import subprocess
 import sys
@@ -59,6 +60,11 @@ def test_installed_package_is_imported_from_the_wheel(site: Path, tmp_path: Path
     assert Path(printed.strip()) == site / "ponn_torch" / "__init__.py"
 
 
-@pytest.mark.skipif(not (ROOT / "ponn_torch" / "cli.py").exists(), reason="no command line yet")
-def test_command_line_runs_from_another_folder(site: Path, tmp_path: Path) -> None:
-    assert "ponn" in run([sys.executable, "-m", "ponn_torch.cli", "--help"], tmp_path, PYTHONPATH=str(site))
+def test_command_line_solves_from_another_folder(site: Path, tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "ponn_torch.cli"]
+    assert "mars_landing" in run([*command, "--help"], tmp_path, PYTHONPATH=str(site))
+    settings = ["problem=mars_landing", "continuation.values=[1.0,0.1,0.01]", "record=minimal"]
+    printed = run([*command, *settings], tmp_path, PYTHONPATH=str(site))
+    (folder,) = (tmp_path / "runs" / "mars_landing").iterdir()
+    assert json.loads((folder / "certificate.json").read_text(encoding="utf-8"))["certified"] is True
+    assert folder.name in printed

@@ -1,0 +1,278 @@
+"""The command line as people meet it: slips, run folders, interruptions, own problems, sweeps."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from ponn_torch.cli import main
+from ponn_torch.solving.solution import Solution
+
+OWN_PROBLEM = """
+from ponn_torch.optimal_control.control_laws import Unconstrained
+from ponn_torch.optimal_control.problem import OptimalControlProblem
+
+
+def shift(distance: float = 1.0, time: float = 1.0) -> OptimalControlProblem:
+    if time < 0.1:
+        raise ValueError(f"time = {time}; allowed: at least 0.1")
+    return OptimalControlProblem(
+        name="shift",
+        states={"x": 1, "v": 1},
+        control=Unconstrained("force", 1),
+        dynamics=lambda t, x, u, p: {"x": x.v, "v": u.force},
+        running_cost=lambda t, x, u, p: 0.5 * (u.force * u.force).sum(-1, keepdim=True),
+        initial={"x": 0.0, "v": 0.0},
+        final={"x": distance, "v": 0.0},
+        final_time=time,
+    )
+
+
+def broken() -> OptimalControlProblem:
+    return undefined_name
+"""
+LANDING = ["problem=mars_landing", "record=minimal"]
+HOPELESS = [*LANDING, "n_starts=1", "ansatz.size=4", "optimizer.stopping.max_iterations=1"]
+
+
+@pytest.fixture
+def own_problem(tmp_path: Path) -> Path:
+    path = tmp_path / "my problem.py"
+    path.write_text(OWN_PROBLEM, encoding="utf-8")
+    return path
+
+
+def outcome_in(folder: Path) -> dict[str, object]:
+    return json.loads((folder / "outcome.json").read_text(encoding="utf-8"))
+
+
+def events_in(folder: Path) -> list[str]:
+    lines = (folder / "records.jsonl").read_text(encoding="utf-8").splitlines()
+    return [json.loads(line)["event"] for line in lines]
+
+
+# -- bad input -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("argument", "told"),
+    [
+        ("problm=mars_landing", ["problm", "'problem'"]),
+        ("sed=3", ["sed", "'seed'"]),
+        ("problem=mars_landng", ["problem = 'mars_landng'", "earth_mars", "'mars_landing'"]),
+        ("problem=null", ["problem = None", "earth_mars"]),
+        ("ansatz=elm_tan", ["ansatz = 'elm_tan'", "chebyshev", "'elm_tanh'"]),
+        ("experiment=ponn_landing_papr", ["experiment = 'ponn_landing_papr'", "'ponn_landing_paper'"]),
+        ("problem.final_time_day=3", ["problem.final_time_day", "'final_time_days'"]),
+        ("optimizer.stoping.tolerance=1", ["optimizer.stoping", "'stopping'"]),
+        ("+optimizer.stopping.tolerence=1", ["optimizer.stopping.tolerence", "'tolerance'"]),
+        ("hydra.run.dirr=x", ["hydra.run.dirr", "'dir'"]),
+        ("problem.regulariser=entrpy", ["problem.regulariser = 'entrpy'", "quadratic", "'entropy'"]),
+        ("nodes.kind=legendre_gaus", ["nodes.kind = 'legendre_gaus'", "uniform", "'legendre_gauss'"]),
+        ("ansatz.conditioning=colums", ["ansatz.conditioning = 'colums'", "'columns'"]),
+        ("mass_variable=logmass", ["mass_variable = 'logmass'", "delta_v", "'log_mass'"]),
+        ("optimizer.linear_solver=chol", ["optimizer.linear_solver = 'chol'", "qr", "'cholesky'"]),
+        ("dtype=float16", ["dtype = 'float16'", "'float64'"]),
+        ("device=gpu", ["device = 'gpu'", "cpu"]),
+        ("problem.final_time_days=long", ["problem.final_time_days = 'long'", "a number"]),
+        ("problem.final_time_days=-3", ["problem.final_time_days = -3", "positive"]),
+        ("problem.initial_mass=null", ["problem.initial_mass = None", "a number"]),
+        ("problem.initial_position_km=[1,2]", ["problem.initial_position_km = [1", "three numbers"]),
+        ("problem.minimum_thrust=2", ["problem.minimum_thrust = 2", "maximum_thrust = 0.5"]),
+        ("n_starts=0", ["n_starts = 0", "at least 1"]),
+        ("nodes.n_nodes=2.5", ["nodes.n_nodes = 2.5", "an integer"]),
+        ("seed=-1", ["seed = -1", "from 0"]),
+        ("tolerances.end_error=0", ["tolerances.end_error = 0", "positive"]),
+        ("continuation.values=[1,-1]", ["continuation", "-1", "positive"]),
+        ("continuation.values=3", ["continuation.values = 3", "a list"]),
+        ("optimizer._target_=os.system", ["optimizer._target_ = 'os.system'", "ponn_torch.optim"]),
+        ("problem._target_=ponn_torch.solving.solver.Solver", ["problem._target_", "ponn_torch.problems"]),
+        ("form._target_=ponn_torch.ansatz.basis.Legendre", ["form.size", "missing"]),
+        ("guess._target_=ponn_torch.solving.paths.Straightline", ["guess._target_", "'StraightLine'"]),
+        ("problem=no_such_module:f", ["problem module = 'no_such_module'"]),
+        ("problem=nothing.py:f", ["problem file = 'nothing.py'", "does not exist"]),
+        ("problem=[", ["'problem=['", "key=value"]),
+        ("seed=1,2", ["seed=1,2", "--multirun"]),
+        ("--sed=3", ["--sed", "no such option"]),
+    ],
+)
+def test_bad_input_is_one_line(
+    argument: str,
+    told: list[str],
+    capsys: pytest.CaptureFixture[str],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert main([argument]) == 1
+    printed = capsys.readouterr()
+    assert printed.out == ""
+    (line,) = printed.err.splitlines()
+    for part in told:
+        assert part in line
+    assert list(tmp_path.iterdir()) == []  # no run folder for what was never run
+
+
+def test_own_problem_with_a_wrong_name_or_argument(
+    own_problem: Path, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    for arguments, told in (
+        ([f"problem={own_problem}:shft"], ["'shft'", "'shift'"]),
+        ([f"problem={own_problem}:shift", "problem.arguments.tme=1"], ["'tme'", "'time'"]),
+        ([f"problem={own_problem}:shift", "problem.arguments.time=0.01"], ["problem.arguments.time = 0.01"]),
+    ):
+        assert main([*arguments, f"hydra.run.dir='{tmp_path}/run'"]) == 1
+        (line,) = capsys.readouterr().err.splitlines()
+        assert all(part in line for part in told)
+
+
+# -- runs ------------------------------------------------------------------------------------------
+
+
+def test_run_leaves_a_complete_folder_and_may_be_run_again(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    folder = tmp_path / "run"
+    arguments = ["problem=mars_landing", "seed=1", "record.stage_figures=false", f"hydra.run.dir='{folder}'"]
+    assert main([*arguments, "continuation.values=[1.0,0.1,0.01]"]) == 0
+    printed = capsys.readouterr().out
+    for part in ("certified extremal", "268.01465", "31.0920056", "39.2202817", "max-min-max", str(folder)):
+        assert part in printed.replace("\n", " ")
+    names = {path.name for path in folder.iterdir()}
+    expected = {"config.yaml", "overrides.yaml", "records.jsonl", "solution", "certificate.json", "figures"}
+    assert expected | {"report.md", "environment.json", "outcome.json"} <= names
+    assert not any(name.startswith("failure") for name in names)
+    assert [name for name in names if name.startswith("events.out.tfevents")]
+    assert {path.suffix for path in (folder / "figures").iterdir()} == {".png"}
+    assert json.loads((folder / "certificate.json").read_text(encoding="utf-8"))["certified"] is True
+    outcome = outcome_in(folder)
+    assert outcome["exit_code"] == 0
+    assert outcome["cost"] == pytest.approx(268.0146563274, abs=1e-6)
+    assert outcome["switch_times"] == pytest.approx([31.0920056478, 39.2202817443], abs=1e-4)
+    assert Solution.load(folder / "solution").cost == pytest.approx(outcome["cost"], abs=1e-9)
+    first = events_in(folder)
+    assert first.count("certificate") == 1
+
+    (folder / "notes.txt").write_text("mine", encoding="utf-8")
+    assert main([*HOPELESS, f"hydra.run.dir='{folder}'"]) == 2
+    assert len(events_in(folder)) < len(first)
+    left = {path.name for path in folder.iterdir()}
+    assert "notes.txt" in left
+    assert {"failure.txt", "outcome.json"} <= left
+    assert not {"certificate.json", "figures"} & left
+    assert not [name for name in left if name.startswith("events")]
+
+
+def test_failed_run_says_why(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    assert main([*HOPELESS, f"hydra.run.dir='{tmp_path}'"]) == 2
+    reason = outcome_in(tmp_path)["message"]
+    assert isinstance(reason, str)
+    assert "start 1 of seed 0 failed" in reason
+    assert reason in capsys.readouterr().out
+    assert (tmp_path / "failure.txt").read_text(encoding="utf-8").startswith(reason)
+    assert "iteration" in events_in(tmp_path)
+
+
+def test_own_problem_from_a_file(own_problem: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    arguments = [f"problem={own_problem}:shift", "problem.arguments.distance=2", "record=minimal"]
+    assert main([*arguments, f"hydra.run.dir='{folder}'"]) == 0
+    # ½∫u² for a rest-to-rest shift by d in time T is 6 d²/T³
+    assert outcome_in(folder)["cost"] == pytest.approx(24.0, abs=1e-9)
+    assert Solution.load(folder / "solution").problem.name == "shift"
+
+
+def test_a_slip_in_an_own_problem_keeps_its_traceback(
+    own_problem: Path, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    folder = tmp_path / "run"
+    assert main([f"problem={own_problem}:broken", f"hydra.run.dir='{folder}'"]) == 3
+    printed = capsys.readouterr()
+    assert "NameError: name 'undefined_name' is not defined" in printed.out
+    assert "Traceback" not in printed.out + printed.err
+    assert "my problem.py:22 in broken" in (folder / "failure.txt").read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_interrupted_run_keeps_records_and_a_solution(number: signal.Signals, tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    # a ladder long enough to be interrupted in the middle
+    slow = ["continuation=tanh_ladder", "continuation.count=2000", "ansatz.size=40", "nodes.n_nodes=80"]
+    command = [sys.executable, "-m", "ponn_torch.cli", *LANDING, *slow, f"hydra.run.dir='{folder}'"]
+    with subprocess.Popen(
+        command, cwd=tmp_path, env=os.environ, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as process:
+        deadline = time.monotonic() + 60
+        while time.monotonic() < deadline and process.poll() is None:
+            records = folder / "records.jsonl"
+            if records.exists() and events_in_progress(records) >= 2:
+                break
+            time.sleep(0.05)
+        process.send_signal(number)
+        out, err = process.communicate(timeout=60)
+    assert process.returncode == 130, out + err
+    assert "Traceback" not in out + err
+    assert "interrupted" in out
+    assert "interrupted" in (folder / "failure.txt").read_text(encoding="utf-8")
+    assert events_in(folder).count("stage") >= 2
+    assert Solution.load(folder / "solution").smoothing is not None
+    assert outcome_in(folder)["exit_code"] == 130
+
+
+def events_in_progress(records: Path) -> int:
+    """Stages that a running process has ended."""
+    return records.read_text(encoding="utf-8").count('"event": "stage"')
+
+
+# -- sweeps and texts ------------------------------------------------------------------------------
+
+
+def test_sweep_counts_and_explains_members_that_fail(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    folder = tmp_path / "a sweep"
+    masses = "problem.initial_mass=1905,-1,1900"
+    assert main(["-m", *LANDING, masses, f"hydra.sweep.dir='{folder}'"]) == 1
+    printed = capsys.readouterr().out
+    assert "2 of 3 certified, 1 failed" in printed
+    assert "problem.initial_mass = -1" in printed.splitlines()[-4]
+    outcomes = [outcome_in(folder / str(i)) for i in range(3)]
+    assert [outcome["exit_code"] for outcome in outcomes] == [0, 1, 0]
+    assert outcomes[0]["known_cost"] == pytest.approx(268.0146563274)
+    assert outcomes[2]["known_cost"] is None
+    assert "problem.initial_mass = -1" in (folder / "1" / "failure.txt").read_text(encoding="utf-8")
+
+
+def test_sweep_over_a_misspelt_config_does_not_begin(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    folder = tmp_path / "sweep"
+    assert main(["-m", "ansatz=chebyshev,elm_tnh", f"hydra.sweep.dir='{folder}'"]) == 1
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "'elm_tanh'" in line
+    assert not folder.exists()
+
+
+def test_help_names_every_group_and_config(capsys: pytest.CaptureFixture[str]) -> None:
+    configs = Path(__file__).resolve().parents[1] / "configs"
+    texts = []
+    for option in ("--help", "--config-groups"):
+        assert main([option]) == 0
+        texts.append(" ".join(capsys.readouterr().out.split()))
+    for path in configs.glob("*/*.yaml"):
+        if path.parent.name != "hydra":
+            assert all(path.parent.name in text and path.stem in text for text in texts)
+
+
+def test_settings_can_be_listed(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert main(["--cfg", "job", "problem=tfc_test_1"]) == 0
+    assert "mass_flow_per_thrust: 0.00050863" in capsys.readouterr().out
+    assert list(tmp_path.iterdir()) == []
