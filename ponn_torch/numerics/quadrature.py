@@ -12,23 +12,19 @@ from ponn_torch.numerics.nodes import make_nodes
 
 def integrate(
     function: Callable[[Tensor], Tensor],
-    start: float,
-    end: float,
+    edges: Tensor,
     *,
-    n_panels: int = 16,
     n_nodes: int = 10,
     tolerance: float = 1e-14,
     n_levels: int = 40,
-    dtype: torch.dtype = torch.float64,
-    device: torch.device | str = "cpu",
+    most_panels: int = 4096,
 ) -> float:
-    """∫ f dt over [start, end] for f (m,) → (m,), called once per level of halving.
+    """∫ f dt over the panels between ``edges`` (P+1,), for f (m,) → (m,) called once per level of halving.
 
-    A panel is accepted when Gauss–Legendre on it and on its halves agree to ``tolerance`` of the whole; thin
-    layers and jumps are thereby resolved down to 2^-n_levels of a panel.
+    A panel is accepted when Gauss–Legendre on it and on its halves agree to ``tolerance`` of ∫|f|; layers and
+    jumps are thereby resolved down to 2^-n_levels of a panel. At ``most_panels`` the rest is accepted.
     """
-    rule = make_nodes("legendre_gauss", n_nodes, dtype=dtype, device=device)
-    edges = torch.linspace(start, end, n_panels + 1, dtype=dtype, device=device)
+    rule = make_nodes("legendre_gauss", n_nodes, dtype=edges.dtype, device=edges.device)
 
     def panels(left: Tensor, right: Tensor) -> tuple[Tensor, Tensor]:
         half = (right - left) / 2
@@ -37,13 +33,13 @@ def integrate(
 
     left, right = edges[:-1], edges[1:]
     coarse, size = panels(left, right)
-    total, whole = 0.0, float(size.sum())
+    total, whole, n_panels = 0.0, float(size.sum()), len(left)
     for level in range(n_levels):
         middle = (left + right) / 2
-        fine, _ = panels(torch.cat([left, middle]), torch.cat([middle, right]))
-        first, second = fine.chunk(2)
+        first, second = panels(torch.cat([left, middle]), torch.cat([middle, right]))[0].chunk(2)
         rough = (first + second - coarse).abs() > tolerance * whole
-        if level == n_levels - 1:
+        n_panels += int(rough.sum())
+        if level == n_levels - 1 or n_panels > most_panels:
             rough = torch.zeros_like(rough)
         total += float((first + second)[~rough].sum())
         if not bool(rough.any()):

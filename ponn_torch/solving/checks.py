@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
+from itertools import pairwise
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 from torch.func import grad
@@ -13,7 +13,7 @@ from torch.func import grad
 from ponn_torch.optimal_control.control_laws import INTERIOR, UPPER, Regime
 from ponn_torch.optimal_control.pontryagin import Setting
 from ponn_torch.optimal_control.problem import Named
-from ponn_torch.solving.flight import Flight
+from ponn_torch.solving.flight import Flight, arc_knots
 from ponn_torch.solving.solution import Solution
 
 
@@ -22,12 +22,20 @@ def _last(solution: Solution, flight: Flight) -> tuple[Tensor, Tensor, Setting]:
     y = torch.from_numpy(flight.y[-1:].copy())
     if not flight.arrived:
         y = torch.full_like(y, torch.nan)
-    return torch.tensor([[flight.t[-1]]]), y, _settings(solution, flight.segment[-1:])
+    return torch.tensor([[flight.t[-1]]]), y, _settings(solution, _segments(solution, flight)[-1:])
 
 
-def _settings(solution: Solution, segment: np.ndarray) -> Setting:
+def _segments(solution: Solution, flight: Flight) -> Tensor:
+    """A segment of its arc for every step."""
+    first = torch.tensor(
+        [segments.start for segments in solution.arc_segments], device=solution.curve.xi.device
+    )
+    return first[torch.from_numpy(flight.arc).to(first.device)]
+
+
+def _settings(solution: Solution, segment: Tensor) -> Setting:
     """The curve's setting at points of the given segments, in float64 on the CPU."""
-    setting = solution.curve.setting(torch.as_tensor(segment, device=solution.curve.xi.device))
+    setting = solution.curve.setting(segment)
     smoothing, arcs = setting.regime.smoothing, setting.regime.arcs
     return Setting(
         Regime(None if smoothing is None else smoothing.double().cpu(), None if arcs is None else arcs.cpu()),
@@ -111,7 +119,7 @@ def depends_on_time(solution: Solution) -> bool:
     t = torch.linspace(float(curve.times[0]), float(curve.times[-1]), 33).to(curve.xi)
     segment = curve.segment_of(t)
     w, _ = solution.at(t, segment)
-    setting = _settings(solution, segment.cpu().numpy())
+    setting = _settings(solution, segment)
     return bool((_time_slope(solution, t.double().cpu()[:, None], w.double().cpu(), setting) != 0).any())
 
 
@@ -120,7 +128,7 @@ def hamiltonian_drift(solution: Solution, flight: Flight, explicit_time: bool) -
     bvp, n = solution.reference, solution.bvp.n_states
     y = torch.from_numpy(flight.y)
     t, w = torch.from_numpy(flight.t)[:, None], y[:, : bvp.dimension]
-    setting = _settings(solution, flight.segment)
+    setting = _settings(solution, _segments(solution, flight))
     h = bvp.hamiltonian(t, w, setting)
     power = bvp.conjugate * w[:, n:] * bvp.rates(t, w, setting)[:, :n] / bvp.cost_unit
     cost = bvp.running_cost(t, w, setting)
@@ -160,26 +168,28 @@ def signs(solution: Solution, tolerance: float, n_points: int = 401) -> tuple[fl
     affine = solution.bvp.law.n_switching == arcs.shape[-1]
     grid = torch.cat([even, near - 1.0, 1.0 - near]).sort().values
     deepest, share = 0.0, 0.0
-    for k in range(curve.collocation.n_segments):
+    for segments, (start, end) in zip(solution.arc_segments, pairwise(arc_knots(solution)), strict=True):
+        codes = arcs[segments.start]
 
-        def depth(z: Tensor, k: int = k) -> tuple[Tensor, Tensor]:
-            t, w, _ = curve.on_segment(z, k)
-            setting = curve.setting(torch.full((len(z),), k, device=z.device))
-            switching = solution.bvp.switching(t[:, None], w, setting)
-            return _depth(switching, arcs[k]), switching
+        def switching(
+            z: Tensor, segments: range = segments, start: float = start, end: float = end
+        ) -> Tensor:
+            t = start + (end - start) * (z + 1.0) / 2
+            w, setting = solution.at(t, curve.segment_of(t).clamp(segments.start, segments.stop - 1))
+            return solution.bvp.switching(t[:, None], w, setting)
 
         z = grid
         for _ in range(3):
-            here, _ = depth(z)
-            deepest = max(deepest, _worst(here.clamp_min(0.0)))
+            depth = _depth(switching(z), codes)
+            deepest = max(deepest, _worst(depth.clamp_min(0.0)))
             # a local maximum between grid points may reach further: look there again, closer
-            rise = (here[1:-1] >= here[:-2]) & (here[1:-1] >= here[2:])
+            rise = (depth[1:-1] >= depth[:-2]) & (depth[1:-1] >= depth[2:])
             peaks = rise.any(-1).nonzero()[:, 0] + 1
             if not len(peaks) or len(peaks) > 50:
                 break
             left, right = z[peaks - 1], z[peaks + 1]
             z = (left[:, None] + (right - left)[:, None] * fractions).flatten().unique()
         if affine:  # an arc with S = 0, or inside the bounds, is singular
-            zero = (depth(even[1:-1])[1].abs() <= tolerance).double().mean(0)
-            share = max(share, float(torch.where(arcs[k] == INTERIOR, 1.0, zero).max()))
+            zero = (switching(even[1:-1]).abs() <= tolerance).double().mean(0)
+            share = max(share, float(torch.where(codes == INTERIOR, 1.0, zero).max()))
     return deepest, share

@@ -21,7 +21,7 @@ from ponn_torch.optimal_control.problem import Named
 from ponn_torch.solving.solution import Solution
 
 Array = NDArray[np.floating]
-Rates = Callable[[float, Array, int], Array]  # (t, y, segment)
+Rates = Callable[[float, Array, int], Array]  # (t, y, arc)
 
 RELATIVE_TOLERANCE, ABSOLUTE_TOLERANCE = 1e-13, 1e-15
 
@@ -31,13 +31,13 @@ class Flight:
     """Accepted steps of a flight, with both sides of every restart.
 
     Attributes:
-        t (m,), y (m, ·): scaled times and integrated values. segment (m,): where each belongs.
+        t (m,), y (m, ·): scaled times and integrated values. arc (m,): index of the arc that each belongs to.
         arrived: the end was reached; ``message`` says why not.
     """
 
     t: Array
     y: Array
-    segment: NDArray[np.integer]
+    arc: NDArray[np.integer]
     n_evaluations: int
     arrived: bool
     message: str = ""
@@ -51,26 +51,26 @@ def fly(
     *,
     most_steps: int = 20000,
 ) -> Flight:
-    """Integrate over the segments between ``knots``, entering a panel of ``resolution`` by its length.
+    """Integrate over the arcs between ``knots``, entering a panel of ``resolution`` by its length.
 
     The panels resolve the control, so that no thin layer of a smoothed switch lies between two stages unseen.
     """
-    times, values, segments, y = [], [], [], start
+    times, values, arcs, y = [], [], [], start
     n_evaluations, message = 0, ""
-    for segment, (begin, end) in enumerate(pairwise(knots)):
-        edges = np.asarray(resolution[segment].edges)
+    for arc, (begin, end) in enumerate(pairwise(knots)):
+        edges = np.asarray(resolution[arc].edges)
         lengths = np.diff(edges)
 
         def reach(t: float, edges: Array = edges, lengths: Array = lengths) -> float:
             ahead = edges[1:] > t
             return float((np.maximum(edges[:-1] - t, 0.0) + lengths)[ahead].min()) if ahead.any() else np.inf
 
-        def function(t: float, y: Array, segment: int = segment) -> Array:
-            return rates(t, y, segment)
+        def function(t: float, y: Array, arc: int = arc) -> Array:
+            return rates(t, y, arc)
 
         times.append(begin)
         values.append(y)
-        segments.append(segment)
+        arcs.append(arc)
         with np.errstate(all="ignore"):
             solver = DOP853(
                 function,
@@ -88,7 +88,7 @@ def fly(
                     break
                 times.append(solver.t)
                 values.append(solver.y)
-                segments.append(segment)
+                arcs.append(arc)
         n_evaluations += solver.nfev
         if solver.status != "finished":
             reason = message or "the states are not finite, or too many steps"
@@ -98,7 +98,7 @@ def fly(
     return Flight(
         np.array(times),
         np.stack(values),
-        np.array(segments),
+        np.array(arcs),
         n_evaluations,
         solver.status == "finished",
         message,
@@ -108,38 +108,28 @@ def fly(
 # -- what is flown -------------------------------------------------------------------------------------------
 
 
-def control_history(solution: Solution) -> list[PiecewiseChebyshev]:
-    """The solution's control over scaled time, per segment; all names side by side, in the user's units."""
-    curve = solution.curve
-    knots = curve.times.tolist()
+def arc_knots(solution: Solution) -> list[float]:
+    """Scaled times at which arcs begin, and the end."""
+    times = solution.curve.times
+    return times[[*(segments.start for segments in solution.arc_segments), -1]].tolist()
 
-    def on(segment: int) -> Callable[[Array], Array]:
+
+def control_history(solution: Solution) -> list[PiecewiseChebyshev]:
+    """The solution's control over scaled time, per arc; all names side by side, in the user's units."""
+    curve, knots = solution.curve, arc_knots(solution)
+
+    def on(segments: range) -> Callable[[Array], Array]:
         def control(t: Array) -> Array:
             times = torch.as_tensor(t).to(curve.xi)
-            w, setting = solution.at(times, torch.full(times.shape, segment, device=times.device))
+            segment = curve.segment_of(times).clamp(segments.start, segments.stop - 1)
+            w, setting = solution.at(times, segment)
             best = solution.bvp.minimiser(times[:, None], w, setting)
             return torch.cat(list(best.control.values()), -1).double().cpu().numpy()
 
         return control
 
-    if solution.kind == "split":
-        return [approximate(on(k), knots[k], knots[k + 1]) for k in range(len(knots) - 1)]
-
-    # fixed knots are no restarts: one history over all segments
-    def control(t: Array) -> Array:
-        index = curve.segment_of(torch.as_tensor(t).to(curve.xi)).cpu().numpy()
-        first = on(0)(t[:1])
-        out = np.empty((len(t), first.shape[-1]))
-        for k in np.unique(index):
-            out[index == k] = on(int(k))(t[index == k])
-        return out
-
-    return [approximate(control, knots[0], knots[-1], n_panels=16 * (len(knots) - 1))]
-
-
-def _knots(solution: Solution) -> list[float]:
-    knots = solution.curve.times.tolist()
-    return knots if solution.kind == "split" else [knots[0], knots[-1]]
+    arcs = zip(solution.arc_segments, pairwise(knots), strict=True)
+    return [approximate(on(segments), start, end) for segments, (start, end) in arcs]
 
 
 def _point_setting(solution: Solution, smoothing: Tensor | None, arcs: Tensor | None) -> Setting:
@@ -158,7 +148,9 @@ def fly_extremal(solution: Solution, history: list[PiecewiseChebyshev], *, expli
     smoothing = (
         torch.zeros(1, dtype=torch.float64) if given.smoothing is None else given.smoothing.double().cpu()
     )
-    codes = torch.zeros(1, 1, dtype=torch.long) if given.arcs is None else given.arcs.cpu()
+    codes = torch.zeros(1, 1, dtype=torch.long)
+    if given.arcs is not None:
+        codes = given.arcs[[segments.start for segments in solution.arc_segments]].cpu()
 
     def right_hand_side(t: Tensor, y: Tensor, arcs: Tensor) -> Tensor:
         setting = _point_setting(solution, smoothing.reshape(1), arcs)
@@ -173,11 +165,11 @@ def fly_extremal(solution: Solution, history: list[PiecewiseChebyshev], *, expli
     t0 = y0.new_full((1,), 0.37 * float(solution.curve.times[-1]))
     graph = trace(right_hand_side, t0, y0, codes[0])
 
-    def rates(t: float, y: Array, segment: int) -> Array:
+    def rates(t: float, y: Array, arc: int) -> Array:
         with torch.inference_mode():
-            return graph(t0.new_tensor([t]), torch.from_numpy(y), codes[segment]).numpy()
+            return graph(t0.new_tensor([t]), torch.from_numpy(y), codes[arc]).numpy()
 
-    return fly(rates, _knots(solution), y0.numpy(), history)
+    return fly(rates, arc_knots(solution), y0.numpy(), history)
 
 
 def fly_control(solution: Solution, history: list[PiecewiseChebyshev]) -> Flight:
@@ -205,10 +197,8 @@ def fly_control(solution: Solution, history: list[PiecewiseChebyshev]) -> Flight
     t0 = y0.new_full((1,), 0.37 * float(solution.curve.times[-1]))
     graph = trace(right_hand_side, t0, y0, torch.from_numpy(history[0](float(t0))))
 
-    def rates(t: float, y: Array, segment: int) -> Array:
+    def rates(t: float, y: Array, arc: int) -> Array:
         with torch.inference_mode():
-            return graph(
-                t0.new_tensor([t]), torch.from_numpy(y), torch.from_numpy(history[segment](t))
-            ).numpy()
+            return graph(t0.new_tensor([t]), torch.from_numpy(y), torch.from_numpy(history[arc](t))).numpy()
 
-    return fly(rates, _knots(solution), y0.numpy(), history)
+    return fly(rates, arc_knots(solution), y0.numpy(), history)

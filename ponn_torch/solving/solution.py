@@ -115,8 +115,19 @@ class Solution:
         codes = self.curve.collocation.setting.regime.arcs
         if codes is None:
             return []
-        first = codes[[0, *self.curve.collocation.switch_knots]]
-        return [",".join(ARC_LABELS[code] for code in row) for row in first.tolist()]
+        rows = codes[[segments.start for segments in self.arc_segments]].tolist()
+        return [",".join(ARC_LABELS[code] for code in row) for row in rows]
+
+    @property
+    def arc_segments(self) -> list[range]:
+        """The segments of each arc; one range over all where the solution is not split."""
+        collocation = self.curve.collocation
+        codes, n_segments = collocation.setting.regime.arcs, collocation.n_segments
+        if codes is None:
+            return [range(n_segments)]
+        changes = (codes[1:] != codes[:-1]).any(-1).nonzero()[:, 0] + 1
+        starts = sorted({0, *collocation.switch_knots, *changes.tolist()})
+        return [range(start, end) for start, end in pairwise([*starts, n_segments])]
 
     @property
     def final_time(self) -> float:
@@ -136,15 +147,17 @@ class Solution:
     @property
     def cost(self) -> float:
         """∫ running cost dt + terminal cost, in the user's units and without the regulariser."""
-        bvp, times, total = self.bvp, self.curve.times.tolist(), 0.0
+        bvp, times, total = self.bvp, self.curve.times, 0.0
         if self.problem.running_cost is not None:
-            for segment, (start, end) in enumerate(pairwise(times)):
 
-                def rate(t: Tensor, segment: int = segment) -> Tensor:
-                    w, setting = self.at(t, torch.full_like(t, segment, dtype=torch.long))
-                    return bvp.running_cost(t[:, None], w, setting)[:, 0]
+            def rate(t: Tensor) -> Tensor:
+                w, setting = self.at(t, self.curve.segment_of(t))
+                return bvp.running_cost(t[:, None], w, setting)[:, 0]
 
-                total += integrate(rate, start, end, dtype=self.curve.xi.dtype, device=self.curve.xi.device)
+            # no panel reaches over a knot, and there are sixteen at least
+            fractions = torch.arange(max(1, 16 // (len(times) - 1)), dtype=times.dtype, device=times.device)
+            inner = times[:-1, None] + times.diff()[:, None] * fractions / len(fractions)
+            total = integrate(rate, torch.cat([inner.flatten(), times[-1:]]))
         return bvp.cost_unit * total + self._terminal_cost
 
     @property
@@ -210,7 +223,7 @@ class Solution:
         even = torch.linspace(0.0, 1.0, n, dtype=times.dtype, device=times.device)
         even = times[0] + (times[-1] - times[0]) * even
         even[-1] = times[-1]
-        switches = self.curve.collocation.switch_knots
+        switches = [segments.start for segments in self.arc_segments[1:]]
         near = (even[:, None] - times[switches]).abs() < 1e-12 * (times[-1] - times[0])
         even = even[~near.any(-1)]
         t = torch.cat([even, times[switches], times[switches]])

@@ -156,10 +156,12 @@ def _make_basis(saved: dict[str, Any], buffers: dict[str, Tensor], dtype: torch.
 
 
 def _fingerprint(curve: Curve) -> dict[str, Tensor]:
-    """What tells one curve of one problem from another: values and rates at a few points, and boundary data."""
+    """What tells one curve of one problem from another: values and rates at some points, boundary data."""
     bvp, n_segments = curve.collocation.bvp, curve.collocation.n_segments
     z = torch.linspace(-0.9, 0.8, 5, dtype=curve.xi.dtype, device=curve.xi.device)
-    t, w, _ = (torch.cat(parts) for parts in zip(*(curve.on_segment(z, k) for k in range(n_segments)), strict=True))
+    t, w, _ = (
+        torch.cat(parts) for parts in zip(*(curve.on_segment(z, k) for k in range(n_segments)), strict=True)
+    )
     segment = torch.arange(n_segments, device=z.device).repeat_interleave(len(z))
     states, costates = bvp.to_physical(w)
     time = curve.times[-1:] if bvp.problem.free_final_time else curve.times.new_tensor([bvp.final_time])
@@ -185,6 +187,6 @@ def _check(curve: Curve, saved: dict[str, Tensor], folder: Path) -> None:
         )
         if not same:
             raise ValueError(
-                f"{folder / WEIGHTS}: the rebuilt {name} is not the saved one; the problem or the basis is another "
-                "than the one that was solved"
+                f"{folder / WEIGHTS}: the rebuilt {name} is not the saved one; problem or basis differ from "
+                "what was solved"
             )
