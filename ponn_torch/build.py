@@ -181,7 +181,15 @@ def _solver(node: dict[str, Any], top: Mapping[str, Any]) -> Solver:
         fields[key] = value_of(_section(node, key), hints[key], key)
     refinement = _section(node, "refinement")
     fields["refinement"] = value_of(refinement, hints["refinement"], "refinement") if refinement else None
-    for key in ("n_starts", "n_certified", "n_segments", "mass_variable", "start_limit", "trust", "tolerances"):
+    for key in (
+        "n_starts",
+        "n_certified",
+        "n_segments",
+        "mass_variable",
+        "start_limit",
+        "trust",
+        "tolerances",
+    ):
         if key in node:
             fields[key] = node.pop(key)
     return call(Solver, fields | {"dtype": DTYPES[top["dtype"]], "device": top["device"]}, "")

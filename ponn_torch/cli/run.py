@@ -119,7 +119,7 @@ def run(config: DictConfig, folder: Path, overrides: Sequence[str], plan: Plan |
     _write_text(
         folder / OUTCOME, json.dumps(finite_or_none(asdict(outcome)), indent=2, ensure_ascii=False) + "\n"
     )
-    print(_screen(outcome, folder, plan, keeper.judged), flush=True)
+    print(_screen(outcome, folder, plan, keeper, time.process_time() - began), flush=True)
     return outcome
 
 
@@ -169,6 +169,8 @@ def _kept(outcome: Outcome, plan: Plan | None, folder: Path, keeper: _Keeper) ->
     if best is not None:
         best.save(folder / SOLUTION)
     figures = plan is not None and plan.recording.figures and best is not None
+    if figures:
+        print("drawing the figures …", flush=True)
     for with_figures in (False, True) if figures else (False,):
         write_report(
             folder,
@@ -200,11 +202,16 @@ def _write_text(path: Path, text: str) -> None:
     path.write_text(text, encoding="utf-8")
 
 
-def _screen(outcome: Outcome, folder: Path, plan: Plan | None, certificate: Certificate | None) -> str:
+def _screen(outcome: Outcome, folder: Path, plan: Plan | None, keeper: _Keeper, seconds: float) -> str:
     """What a person wants to see at the end."""
-    lines = [""]
+    lines, certificate = [""], keeper.judged
     if certificate is not None:
-        lines += [certificate.to_text(), ""]
+        text = certificate.to_text().splitlines()
+        # its lines on cost and time come below, with units
+        last = next((i for i, line in enumerate(text) if line.startswith(f"{certificate.cost_name}: ")), None)
+        # the progress has shown the verdict, which opens the table
+        first = 2 if plan is not None and plan.recording.progress else 0
+        lines += [*text[first:last], ""]
     if plan is not None and outcome.cost is not None:
         display, name = plan.problem.display, plan.problem.cost_name
         cost, clock = display.get("cost", DisplayUnit("")), display.get("time", DisplayUnit("s"))
@@ -212,13 +219,15 @@ def _screen(outcome: Outcome, folder: Path, plan: Plan | None, certificate: Cert
         if outcome.known_cost is not None:
             excess = (outcome.cost - outcome.known_cost) / cost.size
             known = f"; known optimum {outcome.known_cost / cost.size:.10g}, difference {excess:+.1e}"
-        lines.append(f"{name:12}{outcome.cost / cost.size:.10g} {cost.label}{known}")
+        doubt = "" if outcome.certified else ", NOT certified"
+        lines.append(f"{name:12}{outcome.cost / cost.size:.10g} {cost.label}{doubt}{known}")
         if outcome.final_time is not None:
             lines.append(f"{'final time':12}{outcome.final_time / clock.size:.10g} {clock.label}")
         if outcome.switch_times:
             times = ", ".join(f"{time / clock.size:.9g}" for time in outcome.switch_times)
             lines.append(f"{'switches':12}{times} {clock.label} ({'-'.join(outcome.arcs)})")
-    lines.append(f"{'CPU time':12}{outcome.cpu_seconds:.1f} s")
+    solving = sum(stage.cpu_seconds for stage in keeper.stages)
+    lines.append(f"{'CPU time':12}{solving:.1f} s solving, {seconds:.1f} s in all")
     lines.append(f"{'folder':12}{folder}")
     if outcome.exit_code != DONE and (certificate is None or outcome.message != certificate.verdict):
         lines.append(f"{'ended':12}{outcome.message}")

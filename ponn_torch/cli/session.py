@@ -135,9 +135,9 @@ def _summary(folder: Path, members: list[tuple[Path, dict[str, Any]]]) -> str:
         cost = float(outcome["cost"]) if outcome["cost"] is not None else math.nan
         shown = f"{cost:>16.10g}" if math.isfinite(cost) else f"{'–':>16}"
         settings = " ".join(outcome["overrides"]) or "defaults"
-        lines.append(
-            f"{place.name:8}{shown}  {outcome['cpu_seconds']:7.2f}  {settings}: {outcome['message']}"
-        )
+        told = " ".join(["certified", "-".join(outcome["arcs"])]).strip()
+        told = told if outcome["certified"] else outcome["message"]
+        lines.append(f"{place.name:8}{shown}  {outcome['cpu_seconds']:7.2f}  {settings}: {told}")
     failed = sum(outcome["exit_code"] != 0 for _, outcome in members)
     certified = sum(bool(outcome["certified"]) for _, outcome in members)
     lines += ["", f"{certified} of {len(members)} certified, {failed} failed; folder {folder}"]
