@@ -250,11 +250,10 @@ def load_problem(reference: str, **arguments: Any) -> OptimalControlProblem:
         raise ValueError(f"problem reference = {reference!r}; allowed: 'package.module:function' or 'file.py:function'")
     is_file = place.endswith(".py")
     module = _module_from_file(Path(place)) if is_file else _module(place)
-    functions = {
-        key: value for key, value in vars(module).items() if inspect.isfunction(value) and not key.startswith("_")
-    }
+    functions = {key: value for key, value in vars(module).items() if inspect.isfunction(value)}
     if name not in functions:
-        raise ValueError(f"problem reference = {reference!r}: no function {name!r}; {nearest(name, functions)}")
+        own = [key for key, f in functions.items() if f.__module__ == module.__name__ and not key.startswith("_")]
+        raise ValueError(f"problem reference = {reference!r}: no function {name!r}; {nearest(name, own)}")
     parameters = inspect.signature(functions[name]).parameters
     open_ended = any(p.kind is inspect.Parameter.VAR_KEYWORD for p in parameters.values())
     for key, value in arguments.items():
