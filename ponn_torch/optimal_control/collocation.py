@@ -25,6 +25,7 @@ from ponn_torch.numerics.linalg import ArrowJacobian
 from ponn_torch.numerics.nodes import NodeSet, legendre_moments
 from ponn_torch.optimal_control.control_laws import INTERIOR, Regime
 from ponn_torch.optimal_control.pontryagin import BoundaryValueProblem, Setting, probe_points, probe_settings
+from ponn_torch.optimal_control.problem import Named
 
 
 # -- test functions: how the pointwise residual becomes rows --------------------------------------------------------------
@@ -388,6 +389,20 @@ class Collocation:
         rows = torch.cat([equations.flatten(-2), extra], -1)
         # segments must keep their order: a step that turns one around is to be rejected
         return torch.where((h > 0).all(-1, keepdim=True), rows, torch.nan) if len(self.free_times) else rows
+
+    def cost(self, xi: Tensor) -> Tensor:
+        """Running cost (...,) by the nodes' quadrature plus terminal cost, in the user's units: quick, for progress."""
+        bvp, unknowns = self.bvp, self.unpack(xi)
+        h = (unknowns.times[..., 1:] - unknowns.times[..., :-1]) / 2
+        t, w = self._points(self._jets(unknowns, h)[0], unknowns.times, h)
+        setting = self.point_setting(t.shape[:-1])
+        rate = bvp.running_cost(t.reshape(-1, 1), w.reshape(-1, w.shape[-1]), setting).view(t.shape[:-1])
+        total = bvp.cost_unit * (h * (rate @ self.discretisation.nodes.weights)).sum(-1)
+        if bvp.problem.terminal_cost is not None:
+            end = Named(**{k: v[..., None] for k, v in self.setting.parameters.items()})
+            x = bvp.problem.named(bvp.to_physical(unknowns.knots[..., -1, :])[0])
+            total = total + bvp.problem.terminal_cost(unknowns.times[..., -1:] * bvp.time_unit, x, end)[..., 0]
+        return total
 
     def linearise(self, xi: Tensor) -> tuple[Tensor, ArrowJacobian]:
         """(r, J): pointwise cotangents of F by vmapped vjp, pulled back through the tables."""

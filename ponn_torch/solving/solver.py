@@ -25,13 +25,13 @@ from ponn_torch.solving.continuation import Ladder, Outcome, Schedule
 from ponn_torch.solving.guess import Guess, RandomGuess, project
 from ponn_torch.solving import refinement as refinements
 from ponn_torch.solving.observer import Observer, SilentObserver, StageResult
-from ponn_torch.solving.refinement import Refinement, Split
+from ponn_torch.solving.refinement import Refinement, Split, Subdivide
 from ponn_torch.solving.solution import Solution
 
 
 def _default_optimizer() -> Optimizer:
     return LevenbergMarquardt(
-        Stopping(tolerance=1e-9, decrease=1e-3, max_iterations=150, hopeless=0.1, hopeless_after=60)
+        Stopping(tolerance=1e-9, decrease=1e-2, patience=2, max_iterations=150, hopeless=0.1, hopeless_after=60)
     )
 
 
@@ -74,7 +74,7 @@ class Solver:
     conditioning: str = "columns"
     n_segments: int = 1
     optimizer: Optimizer = field(default_factory=_default_optimizer)
-    continuation: Schedule = field(default_factory=lambda: Ladder((1.0, 0.3, 0.1, 0.03, 0.01)))
+    continuation: Schedule = field(default_factory=lambda: Ladder((1.0, 0.3, 0.1, 0.03)))
     refinement: Refinement | None = field(default_factory=Split)
     guess: Guess = field(default_factory=RandomGuess)
     n_starts: int = 10
@@ -235,6 +235,8 @@ class _Run:
         refinement = self.solver.refinement
         if refinement is None:
             return smoothed, ""
+        if isinstance(refinement, Subdivide):
+            smoothed = self._last_stage() or smoothed  # more segments are what an untrusted stage needs
         name = type(refinement).__name__.lower()
         self.observer.stage_started(name, None, len(self.stages))
         refined = refinement.run(smoothed.curve, self._callback)
@@ -259,7 +261,7 @@ class _Run:
                 return {name: float(value) for name, value in collocation.blocks(residual).items()}
 
             def cost() -> float:
-                return Solution(Curve(collocation, xi)).cost
+                return float(collocation.cost(xi))
 
             self.observer.iteration(record, blocks, cost)
 
@@ -275,7 +277,7 @@ class _Run:
 
     def _record(self, name: str, curve: Curve, result: OptimizeResult) -> Solution:
         solution = Solution(curve)
-        self._stage(name, _smoothing(curve.collocation), result, solution.off_node_residual, solution.cost, solution)
+        self._stage(name, _smoothing(curve.collocation), result, solution.off_node_residual, float(curve.collocation.cost(curve.xi)), solution)
         return solution
 
     def _stage(
