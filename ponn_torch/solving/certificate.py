@@ -18,6 +18,7 @@ from ponn_torch.solving.flight import control_history, fly_control, fly_extremal
 from ponn_torch.solving.solution import Solution
 
 SINGULAR_SHARE = 0.05  # of an arc over which |S| cannot be told from zero
+KNOWN_COST_SLACK = 1e-6  # relative, above which an extremal is another than the known one
 
 
 @dataclass(frozen=True)
@@ -165,7 +166,7 @@ def certify(solution: Solution, tolerances: Tolerances | None = None) -> Certifi
     faults += [flight.message for flight in (extremal, control) if not flight.arrived]
     return Certificate(
         certified=not faults,
-        verdict=_verdict(solution, faults),
+        verdict=_verdict(solution, faults, measured["cost_error"]),
         problem=solution.problem.name,
         cost_name=solution.problem.cost_name,
         **measured,
@@ -229,16 +230,21 @@ def _refused(solution: Solution, tolerances: Tolerances) -> Certificate:
     )
 
 
-def _verdict(solution: Solution, faults: list[str]) -> str:
+def _verdict(solution: Solution, faults: list[str], cost_error: float | None = None) -> str:
     if faults:
         return "NOT certified: " + "; ".join(faults)
     smoothing = "" if solution.smoothing is None else f"{solution.smoothing:g}"
     arcs = "-".join(solution.arcs)
-    return {
+    other, known = "", None if solution.kind == "smoothed" else solution.problem.known_cost
+    if known is not None and cost_error is not None and cost_error > KNOWN_COST_SLACK * abs(known):
+        # necessary conditions do not tell extremals apart, the cost does
+        other = f"; not the known optimum: it costs {cost_error:.3g} more"
+    verdict = {
         "split": f"certified extremal with arcs {arcs}: the minimum principle holds on every arc",
         "smoothed": f"certified extremal of the regularised problem at smoothing {smoothing}",
         "smooth": "certified extremal: the minimum principle holds along the whole trajectory",
     }[solution.kind]
+    return verdict + other
 
 
 def _jsonable(value: Any) -> Any:

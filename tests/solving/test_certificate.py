@@ -87,6 +87,14 @@ def test_the_split_landing_is_certified_with_its_arcs(split_landing):
     assert abs(certificate.cost_error) < 1e-8
 
 
+def test_an_extremal_above_the_known_cost_is_called_another_one():
+    cheaper = replace(minimum_energy(), known_cost=5.5)
+    certificate = certify(solve(cheaper, [[0.0, 0, 0, 0], [1.0, 0, 0, 0]]))
+    assert certificate.certified
+    assert certificate.verdict.endswith("not the known optimum: it costs 0.5 more")
+    assert "not the known optimum" not in certify(SOLVED["minimum_energy"]()).verdict
+
+
 # -- what is wrong --------------------------------------------------------------------------------------
 
 
