@@ -1,0 +1,405 @@
+"""From a random start to the known answers, certified; failures are recognised and say why."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from functools import cache
+
+import pytest
+import torch
+from helpers import PROBLEMS, PROBLEMS_WITH_ANSWERS, bvp_of, collocation, mass_variables, problem
+
+from ponn_torch.ansatz.basis import Chebyshev
+from ponn_torch.optim.base import Status, Stopping
+from ponn_torch.optim.least_squares import LevenbergMarquardt
+from ponn_torch.optimal_control.control_laws import Unconstrained
+from ponn_torch.optimal_control.curve import Curve
+from ponn_torch.optimal_control.pontryagin import pontryagin
+from ponn_torch.optimal_control.problem import OptimalControlProblem
+from ponn_torch.solving.certificate import certify
+from ponn_torch.solving.continuation import Ladder, Single
+from ponn_torch.solving.guess import RandomGuess, project
+from ponn_torch.solving.observer import Observer
+from ponn_torch.solving.paths import PolarTransfer
+from ponn_torch.solving.refinement import Subdivide
+from ponn_torch.solving.solution import Solution
+from ponn_torch.solving.solver import Solver, SolveResult
+
+DAY = 86400.0
+AU, SUN_GM = 149.59787e9, 1.32712440018e20
+CANONICAL = math.sqrt(AU**3 / SUN_GM)  # μ = 1
+YEARLY = 58.132 * DAY  # the PoNN paper's unit
+
+
+@dataclass(frozen=True)
+class Answer:
+    """Published numbers: cost and its tolerance, arcs, switch times (s), first costates in given units, H."""
+
+    cost: float
+    tolerance: float
+    arcs: tuple[str, ...] = ()
+    switches: tuple[float, ...] = ()
+    switch_tolerance: float = 1e-6
+    final_time: float | None = None
+    costates: dict[str, tuple[float, ...]] = field(default_factory=dict)
+    costate_units: dict[str, float] = field(default_factory=dict)
+    costate_tolerance: float = 1e-7
+    hamiltonian: float | None = None
+
+
+PAPER_UNITS = {"r": 1000 / AU, "v": 1000 / (AU / YEARLY), "m": 1.0}
+ENERGY_UNITS = {"r": AU / CANONICAL**3, "v": AU / CANONICAL**2}
+ANSWERS = {
+    "minimum_energy": Answer(6.0, 1e-12),
+    "minimum_time": Answer(2.0, 1e-12, ("max", "min"), (1.0,), 1e-12, 2.0),
+    "minimum_fuel": Answer(
+        3 - math.sqrt(5), 1e-12, ("max", "min", "max"), (1.5 - math.sqrt(1.25), 1.5 + math.sqrt(1.25)), 1e-12
+    ),
+    "earth_mars": Answer(
+        396.05984393,
+        1e-7,
+        ("max", "min", "max", "min", "max"),
+        tuple(DAY * t for t in (46.580845161, 68.023322597, 142.717340729, 290.254110121)),
+        1e-7 * DAY,
+        costates={
+            "r": (-0.8716461495216, -1.1497810369671, -0.0875851962203),
+            "v": (-0.5400403260906, -1.4059900229013, 0.3312112393472),
+            "m": (0.4790838018822,),
+        },
+        costate_units=PAPER_UNITS,
+        costate_tolerance=1e-9,
+        hamiltonian=-0.25311643234 * 1000 / YEARLY,
+    ),
+    "energy_transfer": Answer(
+        0.0142251748586 * AU**2 / CANONICAL**3,
+        1e-10,
+        costates={
+            "r": (-0.06696892, -0.09422631, -0.00129002),
+            "v": (-0.04797956, -0.1074862, 0.01120623),
+        },
+        costate_units=ENERGY_UNITS,
+    ),
+    "energy_transfer_limited": Answer(2.2655025004 * YEARLY, 1e-3),
+    "mars_landing": Answer(268.0146563274, 1e-7, ("max", "min", "max"), (31.0920056478, 39.2202817443)),
+    "small_body_landing": Answer(3.9087445862, 1e-8, ("max", "min", "max"), (102.9543890733, 671.7228754865)),
+    "tfc_test_1": Answer(
+        179.4476468458,
+        1e-7,
+        ("min", "max"),
+        (7.4430057683,),
+        final_time=31.2623123369,
+        costates={
+            "r": (-3.472511189e-2, -5.364233455e-3, 2.330559168e-2),
+            "v": (-0.3995834211, -0.1434829029, -0.6586013667),
+            "m": (0.1220243734,),
+        },
+        hamiltonian=0.0,
+    ),
+    "tfc_test_2": Answer(
+        275.2062387119,
+        1e-7,
+        ("max", "min", "max"),
+        (32.4177195331, 38.8374666748),
+        final_time=44.8228903294,
+        costates={
+            "r": (5.991001255e-2, 4.163238549e-2, -2.552218465e-2),
+            "v": (1.939142394, 1.309112918, -1.653061741),
+            "m": (0.2630713167,),
+        },
+        hamiltonian=0.0,
+    ),
+}
+
+
+def test_every_published_answer_is_asked_for():
+    assert set(ANSWERS) == set(PROBLEMS_WITH_ANSWERS)
+
+
+@cache
+def solved(name: str, seed: int = 0) -> SolveResult:
+    guess = PolarTransfer() if name.startswith("energy") else RandomGuess()
+    return Solver(guess=guess).solve(problem(name), seed)
+
+
+@pytest.mark.parametrize("name", ANSWERS)
+def test_published_problems_are_solved_to_their_answers(name):
+    result, answer = solved(name), ANSWERS[name]
+    assert result.certified, result.message
+    solution = result.solution
+    assert solution.cost == pytest.approx(answer.cost, abs=answer.tolerance)
+    assert solution.problem.known_cost == pytest.approx(answer.cost, abs=answer.tolerance)
+    if answer.arcs:
+        assert tuple(solution.arcs) == answer.arcs
+        assert solution.switch_times == pytest.approx(answer.switches, rel=0, abs=answer.switch_tolerance)
+    if answer.final_time is not None:
+        assert solution.final_time == pytest.approx(answer.final_time, abs=1e-7)
+    start = solution(0.0)
+    for state, expected in answer.costates.items():
+        found = start.costates[state].flatten() / answer.costate_units.get(state, 1.0)
+        largest = max(abs(x) for x in expected)
+        assert found.tolist() == pytest.approx(
+            expected, rel=0, abs=answer.costate_tolerance * max(1.0, largest)
+        )
+        assert found.tolist() == pytest.approx(expected, rel=0, abs=1e-6 * largest)
+    if answer.hamiltonian is not None:
+        times = torch.linspace(0, solution.final_time, 9, dtype=torch.float64)
+        scale = float(solution.bvp.cost_unit / solution.bvp.time_unit)
+        h = solution(times).hamiltonian.flatten().tolist()
+        assert h == pytest.approx([answer.hamiltonian] * 9, rel=0, abs=1e-9 * scale)
+
+
+def test_the_limited_energy_transfer_burns_its_known_fuel():
+    solution = solved("energy_transfer_limited").solution
+    end = solution(solution.final_time)
+    assert 1000.0 - float(end.states["m"]) == pytest.approx(443.4740587668, abs=1e-6)
+    # δ = 1 for 4.2 % of the time
+    throttle = solution(torch.linspace(0, solution.final_time, 2001)).control["thrust_magnitude"] / 0.5
+    assert float((throttle > 1 - 1e-9).double().mean()) == pytest.approx(0.042, abs=2e-3)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["earth_mars", "mars_landing"])
+@pytest.mark.parametrize("seed", range(20))
+def test_every_random_start_ends_in_the_optimum(name, seed):
+    result = solved(name, seed)
+    assert result.certified, result.message
+    assert result.solution.cost == pytest.approx(ANSWERS[name].cost, abs=1e-6)
+    assert result.solution.switch_times == pytest.approx(ANSWERS[name].switches, abs=1e-4 * DAY)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("mass_variable", ["mass", "delta_v"])
+@pytest.mark.parametrize("name", [name for name in ANSWERS if problem(name).mass is not None])
+def test_every_mass_variable_finds_the_optimum(name, mass_variable):
+    guess = PolarTransfer() if name.startswith("energy") else RandomGuess()
+    result = Solver(guess=guess, mass_variable=mass_variable).solve(problem(name))
+    assert result.certified, result.message
+    assert result.solution.cost == pytest.approx(ANSWERS[name].cost, abs=10 * ANSWERS[name].tolerance)
+
+
+@pytest.mark.slow
+def test_standard_gravity_tells_the_papers_two_numbers_apart():
+    made = PROBLEMS["mars_landing"](standard_gravity=9.81)
+    assert made.known_cost == 267.9318584923
+    solution = Solver().solve(made).solution
+    assert solution.cost == pytest.approx(267.9318584923, abs=1e-7)
+    assert solution.switch_times == pytest.approx((31.0938504661, 39.2200555407), abs=1e-6)
+
+
+# -- smoothed problems are problems of their own -------------------------------------------------------------
+
+SMOOTHED = {
+    ("earth_mars", 1.0): 449.2546446704,
+    ("earth_mars", 0.1): 399.6389415258,
+    ("mars_landing", 0.1): 268.7946271902,
+    ("mars_landing", 0.01): 268.0307003834,
+}
+
+
+@cache
+def coarse(name: str) -> dict[float, Curve]:
+    """One polynomial per chain down the ladder, from a random start."""
+    made = collocation(bvp_of(name), n_neurons=30, n_nodes=60, smoothing=1.0)
+    xi, curves = project(made, RandomGuess().curve(made.bvp, 0)), {}
+    for rho in (1.0, 0.3, 0.1, 0.03, 0.01):
+        made = made.with_setting(smoothing=rho)
+        xi = LevenbergMarquardt(Stopping(tolerance=1e-9, decrease=1e-3)).run(made, xi).xi
+        curves[rho] = Curve(made, xi)
+    return curves
+
+
+@cache
+def smoothed(name: str, smoothing: float, mass_variable: str) -> Solution:
+    """The coarse curve, written in a mass variable, then on segments until it holds between the nodes."""
+    start, bvp = coarse(name)[smoothing], bvp_of(name, mass_variable)
+    made = collocation(bvp, n_neurons=30, n_nodes=60, smoothing=smoothing)
+    xi = project(made, lambda t: bvp.to_scaled(*start.collocation.bvp.to_physical(start(t))))
+    refined = Subdivide().run(Curve(made, xi))
+    assert refined.outcome.name == "SOLVED"
+    return Solution(refined.curve)
+
+
+CASES = [(name, rho, v) for name, rho in SMOOTHED for v in mass_variables(name)]
+
+
+@pytest.mark.parametrize(("name", "smoothing", "mass_variable"), CASES)
+def test_smoothed_fuels_do_not_depend_on_the_mass_variable(name, smoothing, mass_variable):
+    solution = smoothed(name, smoothing, mass_variable)
+    assert solution.cost == pytest.approx(SMOOTHED[name, smoothing], abs=1e-7)
+
+
+@pytest.mark.parametrize("name", ["earth_mars", "mars_landing"])
+def test_costates_of_a_smoothed_problem_do_not_depend_on_the_mass_variable(name):
+    t = torch.linspace(0, problem(name).time_guess, 50, dtype=torch.float64)
+    reference, *others = (smoothed(name, 0.1, v)(t) for v in mass_variables(name))
+    for other in others:
+        for state, expected in reference.costates.items():
+            size = float(expected.abs().max())
+            assert float((other.costates[state] - expected).abs().max()) < 1e-8 * size
+
+
+@pytest.mark.parametrize(("name", "smoothing"), [("earth_mars", 0.1), ("mars_landing", 0.01)])
+def test_the_regularised_hamiltonian_is_constant_along_the_flown_extremal(name, smoothing):
+    certificate = certify(smoothed(name, smoothing, "log_mass"))
+    assert certificate.certified, certificate.to_text()
+    assert certificate.hamiltonian_drift < 1e-9
+    assert certificate.flown_cost == pytest.approx(SMOOTHED[name, smoothing], abs=1e-5)
+
+
+def test_a_few_fixed_segments_do_it_too():
+    ladder = Ladder((1.0, 0.3, 0.1))
+    solver = Solver(n_segments=6, basis=Chebyshev(30), n_nodes=45, continuation=ladder, refinement=None)
+    stages = {stage.smoothing: stage for stage in solver.solve(problem("earth_mars")).stages}
+    for smoothing in (1.0, 0.1):
+        fuel = SMOOTHED["earth_mars", smoothing]
+        assert stages[smoothing].solution.cost == pytest.approx(fuel, abs=1e-5)
+        assert stages[smoothing].cost == pytest.approx(fuel, abs=1e-3)  # by the nodes' own quadrature
+
+
+# -- what cannot be trusted ----------------------------------------------------------------------------------
+
+
+def test_even_nodes_with_twice_as_many_as_neurons_fail_between_the_nodes():
+    """The residual at the nodes looks solved; only between them does the polynomial show what it is."""
+    optimizer = LevenbergMarquardt(Stopping(tolerance=1e-9, decrease=1e-3, max_iterations=25))
+    results = {
+        kind: Solver(
+            basis=Chebyshev(60),
+            n_nodes=120,
+            node_kind=kind,
+            refinement=None,
+            n_starts=1,
+            continuation=Single(1.0),
+            optimizer=optimizer,
+        ).solve(problem("mars_landing"))
+        for kind in ("uniform", "legendre_gauss")
+    }
+    even, good = results["uniform"], results["legendre_gauss"]
+    assert even.stages[-1].norm < 1e-3
+    assert even.stages[-1].off_node_residual > 1.0
+    assert not even.certified
+    assert "off node residual" in even.message
+    assert (
+        "no stage solves its own problem between the nodes" in even.message or "NOT certified" in even.message
+    )
+    assert good.stages[-1].off_node_residual < 1e-7
+    assert good.solution.cost == pytest.approx(272.1667469489, abs=1e-5)
+
+
+def test_the_sharpest_trusted_stage_is_kept():
+    solver = Solver(refinement=None, n_starts=1, continuation=Ladder((1.0, 0.3, 0.1, 0.01, 1e-3, 1e-4)))
+    result = solver.solve(problem("mars_landing"))
+    by_smoothing = {stage.smoothing: stage.off_node_residual for stage in result.stages}
+    assert by_smoothing[1e-4] > 0.1 > by_smoothing[0.1]
+    assert result.solution.smoothing > 1e-3
+    assert not result.certified  # one polynomial is not enough for the defaults
+
+
+def test_an_infeasible_transfer_is_recognised_early_with_a_message():
+    result = Solver(n_starts=2).solve(PROBLEMS["earth_mars"](maximum_thrust=0.2), seed=3)
+    assert result.certificate is None
+    assert not result.certified
+    assert result.n_starts == 2
+    assert result.message.startswith("start 2 of seed 3 failed: ‖r‖ = 0.")
+    assert "after the first stage" in result.message
+    assert [stage.start for stage in result.stages] == [0, 1]
+    assert all(stage.n_iterations <= 60 and stage.norm > 0.1 for stage in result.stages)
+    assert result.solution is not None  # what there is can be looked at
+
+
+def test_a_start_outside_the_domain_of_the_dynamics_names_the_equation():
+    made = OptimalControlProblem(
+        name="logarithmic_drag",
+        states={"x": 1, "v": 1},
+        control=Unconstrained("u", 1),
+        dynamics=lambda t, x, u, p: {"x": x.v, "v": u.u - torch.log(x.x)},
+        running_cost=lambda t, x, u, p: 0.5 * u.u**2,
+        initial={"x": 1.0, "v": -8.0},
+        final={"x": 1.0, "v": 8.0},
+        final_time=2.0,
+    )
+    result = Solver(n_starts=2, basis=Chebyshev(8), n_nodes=16).solve(made)
+    assert result.solution is None
+    assert "not finite at the starting point, in the equations of: v" in result.message
+
+
+# -- several extremals, several starts -----------------------------------------------------------------------
+
+
+@pytest.mark.slow
+def test_the_cheapest_of_several_certified_extremals_is_kept():
+    result = Solver(n_certified=3).solve(problem("energy_transfer"))
+    assert result.certified
+    unit = AU**2 / CANONICAL**3
+    costs = [stage.cost / unit for stage in result.stages if stage.name == "split" and stage.cost > 0]
+    assert max(costs) == pytest.approx(1.388, abs=1e-3)  # another extremal, just as well solved
+    assert result.solution.cost / unit == pytest.approx(0.0142251748586, abs=1e-12)
+
+
+def test_a_seed_is_reproduced_bit_by_bit():
+    again = Solver().solve(problem("minimum_fuel"), 0)
+    assert torch.equal(again.solution.curve.xi, solved("minimum_fuel").solution.curve.xi)
+    assert [s.norm for s in again.stages] == [s.norm for s in solved("minimum_fuel").stages]
+    other = Solver().solve(problem("minimum_fuel"), 1)
+    assert other.stages[0].records[0]["norm"] != again.stages[0].records[0]["norm"]
+    assert other.solution.cost == pytest.approx(again.solution.cost, abs=1e-12)
+
+
+class Interrupting(Observer):
+    """Presses Ctrl-C in the second iteration of a stage."""
+
+    def __init__(self, *stage) -> None:
+        self.stage, self.now, self.reported = stage, (), None
+
+    def stage_started(self, name, smoothing, index):
+        self.now = (name, smoothing)
+
+    def iteration(self, record, blocks, cost):
+        if self.now == self.stage and record["iteration"] == 2:
+            raise KeyboardInterrupt
+
+    def solution(self, solution):
+        self.reported = solution
+
+
+@pytest.mark.parametrize("stage", [("smooth", 1.0), ("smooth", 0.1), ("split", None)])
+def test_an_interrupted_solve_keeps_what_it_had(stage):
+    observer = Interrupting(*stage)
+    result = Solver(continuation=Ladder((1.0, 0.3, 0.1))).solve(problem("mars_landing"), 0, observer)
+    assert result.interrupted
+    assert "interrupted" in result.message
+    assert (result.stages[-1].name, result.stages[-1].smoothing) == stage
+    assert result.stages[-1].status is Status.INTERRUPTED
+    assert result.stages[-1].n_iterations == 2
+    assert result.solution is observer.reported is not None
+
+
+def test_no_bounds_means_no_smoothing_and_one_stage():
+    result = solved("minimum_energy")
+    assert [stage.name for stage in result.stages] == ["smooth", "split"]
+    assert result.stages[0].smoothing is None
+
+
+@pytest.mark.parametrize("field", ["n_nodes", "n_segments", "n_starts", "n_certified"])
+def test_errors_name_field_value_and_what_is_allowed(field):
+    with pytest.raises(ValueError, match=f"{field} = 0; allowed: at least 1"):
+        Solver(**{field: 0})
+
+
+def test_a_problem_of_ones_own_takes_a_few_lines():
+    """A pendulum swung up with the least torque: no costate equation is written."""
+    swing = OptimalControlProblem(
+        name="pendulum",
+        states={"angle": 1, "rate": 1},
+        control=Unconstrained("torque", 1),
+        dynamics=lambda t, x, u, p: {"angle": x.rate, "rate": u.torque - p.gravity * torch.sin(x.angle)},
+        running_cost=lambda t, x, u, p: 0.5 * u.torque**2,
+        parameters={"gravity": 1.0},
+        initial={"angle": 0.0, "rate": 0.0},
+        final={"angle": math.pi, "rate": 0.0},
+        final_time=3.0,
+    )
+    result = Solver(guess=RandomGuess(scale=0.1)).solve(swing)
+    assert result.certified, result.message
+    assert len(pontryagin(swing).chains) == 2  # angle and rate, and their costates
