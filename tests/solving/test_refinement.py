@@ -1,0 +1,143 @@
+"""Refinements end in a solution with the right arcs, or say that they do not."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import pytest
+import torch
+from helpers import bvp_of, collocation
+
+from ponn_torch.ansatz.basis import Chebyshev
+from ponn_torch.numerics.nodes import make_nodes
+from ponn_torch.optim.base import Status, Stopping
+from ponn_torch.optim.least_squares import LevenbergMarquardt
+from ponn_torch.optimal_control.collocation import Collocation, Discretisation
+from ponn_torch.optimal_control.control_laws import Regime
+from ponn_torch.optimal_control.curve import Curve
+from ponn_torch.optimal_control.pontryagin import Setting
+from ponn_torch.solving.guess import RandomGuess, project
+from ponn_torch.solving.refinement import Outcome, Split, Subdivide
+from ponn_torch.solving.solution import Solution
+from ponn_torch.solving.switching import find_structure
+
+OPTIMA = {"earth_mars": 396.05984393, "mars_landing": 268.0146563274}
+
+
+@cache
+def smoothed(name: str, smoothing: float) -> Curve:
+    """Down the ladder on one polynomial per chain."""
+    made = collocation(bvp_of(name), n_neurons=30, n_nodes=60, smoothing=1.0)
+    xi = project(made, RandomGuess().curve(made.bvp, 0))
+    for rho in (1.0, 0.3, 0.1, 0.03):
+        if rho < smoothing:
+            break
+        made = made.with_setting(smoothing=rho)
+        xi = LevenbergMarquardt(Stopping(tolerance=1e-9, decrease=1e-3)).run(made, xi).xi
+    return Curve(made, xi)
+
+
+@cache
+def blunt_split() -> tuple[Collocation, Curve]:
+    """Earth–Mars split at the two switches that ρ = 1 shows."""
+    start = smoothed("earth_mars", 1.0)
+    structure = find_structure(start)
+    assert structure.arcs.flatten().tolist() == [2, 0, 2]
+    nodes = make_nodes("legendre_gauss", 44, dtype=torch.float64)
+    disc = Discretisation(start.collocation.bvp, Chebyshev(30), nodes, conditioning="orthonormal")
+    times = torch.cat([start.times[:1], structure.times, start.times[-1:]])
+    made = Collocation.on_segments(disc, times, events=[0, 0], setting=Setting(Regime(arcs=structure.arcs)))
+    stopping = Stopping(tolerance=1e-12, decrease=1e-2, max_iterations=60)
+    result = LevenbergMarquardt(stopping, damping=1e-8).run(made, project(made, start))
+    assert float(result.norm) < 1e-7
+    return made, Curve(made, result.xi)
+
+
+def test_an_extremal_with_too_few_arcs_is_seen_by_the_sign_of_s():
+    """Three arcs solve all their equations, at 400.011 kg; S asks for five."""
+    _, curve = blunt_split()
+    assert Solution(curve).cost == pytest.approx(400.011, abs=1e-3)
+    assert curve.off_node_residual() < 1e-6
+    assert find_structure(curve).arcs.flatten().tolist() == [2, 0, 2, 0, 2]
+
+
+@pytest.mark.parametrize("max_rounds", [1, 3])
+def test_a_split_from_a_blunt_curve_is_right_or_says_that_it_is_not(max_rounds):
+    refined = Split(max_rounds=max_rounds).run(smoothed("earth_mars", 1.0))
+    if refined.outcome is Outcome.SOLVED:
+        assert Solution(refined.curve).cost == pytest.approx(OPTIMA["earth_mars"], abs=1e-6)
+        assert Solution(refined.curve).arcs == ["max", "min", "max", "min", "max"]
+    else:
+        assert refined.rounds
+
+
+@pytest.mark.parametrize(("name", "smoothing"), [("earth_mars", 0.03), ("mars_landing", 0.1)])
+def test_a_split_solves_between_the_nodes_too(name, smoothing):
+    split = Split()
+    refined = split.run(smoothed(name, smoothing))
+    assert refined.outcome is Outcome.SOLVED
+    assert Solution(refined.curve).cost == pytest.approx(OPTIMA[name], abs=1e-6)
+    assert refined.curve.off_node_residual() < 2 * split.off_node_tolerance
+    assert float(refined.rounds[-1].norm) < split.residual_tolerance
+    # the arcs are the ones that S asks for, and S vanishes at the switches
+    solution, found = Solution(refined.curve), find_structure(refined.curve)
+    arcs = [{"min": 0, "max": 2}[arc] for arc in solution.arcs]
+    assert found.arcs.flatten().tolist() == arcs
+    switching = solution(solution.switch_times).switching.flatten()
+    assert float(switching.abs().max()) < 1e-10
+
+
+def test_every_round_of_a_split_calls_back_with_its_own_residual():
+    seen = []
+
+    def callback(made: Collocation):
+        seen.append([made, 0])
+
+        def on_iteration(record, xi, residual):
+            seen[-1][1] += 1
+            assert made.blocks(residual)["switching"] >= 0
+            assert xi.shape == (made.n_unknowns,)
+
+        return on_iteration
+
+    refined = Split().run(smoothed("mars_landing", 0.1), callback)
+    assert [count for _, count in seen] == [result.n_iterations for result in refined.rounds]
+
+
+def test_more_arcs_than_allowed_are_not_tried():
+    refined = Split(max_arcs=2).run(smoothed("mars_landing", 0.1))
+    assert refined.outcome is Outcome.TOO_MANY_ARCS
+
+
+def test_subdivision_keeps_the_regime_and_meets_its_tolerance():
+    start = smoothed("mars_landing", 0.1)
+    refined = Subdivide(off_node_tolerance=1e-8).run(start)
+    assert refined.outcome is Outcome.SOLVED
+    assert Solution(refined.curve).smoothing == pytest.approx(0.1)
+    assert refined.curve.off_node_residual() < 2e-8
+    assert Solution(refined.curve).cost == pytest.approx(268.7946271902, abs=1e-6)
+    counts = [result.xi.shape[-1] for result in refined.rounds]
+    assert counts == sorted(counts)
+
+
+def test_subdivision_says_when_segments_or_rounds_run_out():
+    start = smoothed("mars_landing", 0.03)
+    few = Subdivide(max_segments=8, n_neurons=6, n_nodes=9).run(start)
+    assert few.outcome is Outcome.TOO_MANY_SEGMENTS
+    once = Subdivide(max_rounds=1, n_neurons=6, n_nodes=9).run(start)
+    assert once.outcome in (Outcome.COARSE, Outcome.RESIDUAL)
+    assert len(once.rounds) == 1
+
+
+@pytest.mark.parametrize("make", [Split, Subdivide])
+def test_an_interrupted_refinement_keeps_its_curve(make):
+    def callback(made: Collocation):
+        def on_iteration(record, xi, residual):
+            raise KeyboardInterrupt
+
+        return on_iteration
+
+    refined = make().run(smoothed("mars_landing", 0.1), callback)
+    assert refined.outcome is Outcome.INTERRUPTED
+    assert refined.rounds[-1].status is Status.INTERRUPTED
+    assert torch.isfinite(refined.curve.xi).all()
