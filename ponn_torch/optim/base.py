@@ -25,7 +25,7 @@ class Status(Enum):
     MAX_ITERATIONS = "the iteration limit was reached"
     TIME_LIMIT = "the CPU time limit was reached"
     HOPELESS = "the residual was still above the limit that tells a failed start"
-    NON_FINITE = "the residual is not finite at the starting point"
+    NON_FINITE = "the Jacobian is not finite at the best point"
     INTERRUPTED = "interrupted from the keyboard"
 
     @property

@@ -151,6 +151,7 @@ class LevenbergMarquardt:
                     (rises & rule.past_tolerance, Status.ROUND_OFF),
                     (slow >= rule.patience, Status.SMALL_DECREASE),
                     (accepted & (step_norm < rule.step), Status.SMALL_STEP),
+                    (~torch.isfinite(scale).all(-1), Status.NON_FINITE),
                     (damping > self.largest_damping, Status.DAMPING),
                     ((norm > rule.hopeless) & (iteration >= rule.hopeless_after), Status.HOPELESS),
                     (torch.tensor(iteration >= rule.max_iterations), Status.MAX_ITERATIONS),

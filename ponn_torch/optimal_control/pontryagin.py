@@ -154,6 +154,9 @@ class BoundaryValueProblem:
         """The Hamiltonian (..., 1) that the setting's law minimises, regulariser included, in cost_unit/time_unit."""
         x, costates = self.to_physical(w)
         p, best = Named(**setting.parameters), self.minimiser(t, w, setting)
+        # at the minimiser H is stationary in the control, so its derivative is that at fixed control; through a saturated
+        # η it would be 0 · ∞
+        best = Minimiser({k: v.detach() for k, v in best.control.items()}, best.switching, best.fraction.detach())
         h = self._hamiltonian(t * self.time_unit, x, costates, Named(**best.control), p)[0]
         if setting.regime.smoothing is not None and setting.regime.arcs is None:
             h = h + self.law.penalty(best, p, setting.regime.smoothing)

@@ -79,7 +79,9 @@ class Segmentation:
     residual_tolerance: float = 1e-6
     off_node_tolerance: float = 1e-9
     stopping: Stopping = field(
-        default_factory=lambda: Stopping(tolerance=1e-13, decrease=1e-2, patience=2, max_iterations=40)
+        default_factory=lambda: Stopping(
+            tolerance=1e-13, decrease=1e-2, patience=2, max_iterations=80, hopeless=1e-3, hopeless_after=30
+        )
     )
     damping: float = 1e-8
     linear_solver: str = "cholesky"
@@ -136,23 +138,49 @@ class Subdivide(Segmentation):
 class Split(Segmentation):
     """Solve between switches until arcs and S agree and the equations hold between the nodes.
 
-    Every arc is one or more segments; those that subdivide it sit at fixed fractions between its switches.
+    Every arc is one or more segments; those that subdivide it sit at fixed fractions between its switches. Arcs are added
+    where S asks for them and merged away where a failed round made them collapse. When this does not end, the smoothed curve
+    was too blunt to show the structure: it is sharpened, and the split starts anew on more segments.
 
     Attributes:
         max_arcs: more arcs than this are taken for a sign of a singular arc.
         short_arc: arcs shorter than this fraction of the final time in a failed round are merged away.
+        max_sharpenings, sharpening: how often, and by which factor, the smoothing is lowered after a failure.
     """
 
     max_arcs: int = 40
-    short_arc: float = 1e-3
+    short_arc: float = 1e-4
+    max_sharpenings: int = 4
+    sharpening: float = 0.3
 
     def run(self, start: Curve, callback: MakeCallback | None = None) -> Refined:
-        bvp, rounds = start.collocation.bvp, []
-        disc = self.discretisation(bvp)
-        parameters = start.collocation.setting.parameters
+        disc, smoothed, rounds = self.discretisation(start.collocation.bvp), start, []
+        refined = self._split(disc, smoothed, self.n_segments, rounds, callback)
+        for attempt in range(2, self.max_sharpenings + 2):
+            if refined.outcome in (Outcome.SOLVED, Outcome.INTERRUPTED):
+                break
+            if smoothed.collocation.setting.regime.smoothing is not None:
+                smoothed, result = self._sharpened(disc, smoothed, attempt * self.n_segments, callback)
+                rounds.append(result)
+                if result.status is Status.INTERRUPTED:
+                    return Refined(smoothed, Outcome.INTERRUPTED, rounds)
+            refined = self._split(disc, smoothed, attempt * self.n_segments, rounds, callback)
+        return refined
+
+    def _split(
+        self,
+        disc: Discretisation,
+        start: Curve,
+        n_segments: int,
+        rounds: list[OptimizeResult],
+        callback: MakeCallback | None,
+    ) -> Refined:
+        """Rounds of solving, repairing the arcs and halving segments, from one smoothed curve."""
+        bvp, parameters = disc.bvp, start.collocation.setting.parameters
         curve, outcome = start, Outcome.STRUCTURE
         structure = find_structure(start)
-        segments = _spread(structure, start.times, self.n_segments)
+        segments = _spread(structure, start.times, n_segments)
+        tried: list[Structure] = []
         for _ in range(self.max_rounds):
             if len(structure) > self.max_arcs:
                 return Refined(curve, Outcome.TOO_MANY_ARCS, rounds)
@@ -167,20 +195,19 @@ class Split(Segmentation):
             if result.status is Status.INTERRUPTED:
                 return Refined(solution, Outcome.INTERRUPTED, rounds)
             if not self.solved(result):
-                outcome = Outcome.RESIDUAL
                 ends = solution.times[[0, *collocation.switch_knots, -1]]
                 repaired = without_short_arcs(structure, ends, self.short_arc)
-                if repaired.same_arcs(structure):
-                    # too few neurons look the same as wrong arcs: more segments, from the same start
-                    segments = segments.halved()
-                else:
-                    curve, structure = solution, repaired
-                    segments = _spread(structure, solution.times, self.n_segments)
+                if any(repaired.same_arcs(other) for other in [structure, *tried]):
+                    return Refined(solution, Outcome.RESIDUAL, rounds)
+                tried.append(structure)
+                curve, structure, outcome = solution, repaired, Outcome.RESIDUAL
+                segments = _spread(structure, solution.times, n_segments)
                 continue
             curve, found = solution, find_structure(solution)
             if not found.same_arcs(structure):
+                tried.append(structure)
                 outcome, structure = Outcome.STRUCTURE, found
-                segments = _spread(found, solution.times, self.n_segments)
+                segments = _spread(found, solution.times, n_segments)
                 continue
             coarse = solution.off_node_residuals() > self.off_node_tolerance
             if not bool(coarse.any()):
@@ -188,6 +215,15 @@ class Split(Segmentation):
             outcome = Outcome.COARSE
             segments = Segments(solution.times, segments.events, segments.arcs).halved(coarse)
         return Refined(curve, outcome, rounds)
+
+    def _sharpened(
+        self, disc: Discretisation, curve: Curve, n_segments: int, callback: MakeCallback | None
+    ) -> tuple[Curve, OptimizeResult]:
+        """The smoothed problem at a lower smoothing."""
+        smoothing = curve.collocation.setting.regime.smoothing
+        share = torch.linspace(0, 1, n_segments + 1, dtype=curve.xi.dtype, device=curve.xi.device)
+        collocation = Collocation.on_segments(disc, share * curve.times[-1], setting=curve.collocation.setting)
+        return self.solve(collocation.with_setting(smoothing=self.sharpening * smoothing), curve, callback)
 
 
 @dataclass(frozen=True)
