@@ -15,7 +15,7 @@ from ponn_torch.optimal_control.pontryagin import Setting
 
 @dataclass(frozen=True)
 class Structure:
-    """Arcs of a bounded control: codes (K, m), scaled times of the K−1 switches, which function switches there."""
+    """Arcs of a bounded control: codes (K, m), scaled times of the K−1 switches, and what switches there."""
 
     arcs: Tensor
     times: Tensor
@@ -43,7 +43,7 @@ def grid(curve: Curve, n_points: int = 400) -> tuple[Tensor, Tensor]:
 
 
 def find_structure(curve: Curve, n_points: int = 1000, polish: int = 4) -> Structure:
-    """Zeros of S on a fine grid, polished by false position, and the arcs that the minimum principle asks for."""
+    """Zeros of S on a fine grid, polished by false position, and the arcs that S asks for."""
     t, w = grid(curve, max(100, n_points // curve.collocation.n_segments))
     s = switching_along(curve, t, w)
     law = curve.collocation.bvp.law

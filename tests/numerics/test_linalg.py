@@ -16,27 +16,33 @@ def dense(batch: tuple[int, ...] = (), rows: int = 12, columns: int = 7, seed: i
     return DenseJacobian(random(*batch, rows, columns, seed=seed, low=-1.0))
 
 
+NO_UNKNOWN = 6
+# what three segments see of six shared unknowns: some share, one sees a column twice, one sees none at all
+INDEX = [[0, 1, 2, NO_UNKNOWN, 3], [2, 3, 4, NO_UNKNOWN, 0], [4, 5, 1, 5, NO_UNKNOWN]]
+NEIGHBOURS = [[NO_UNKNOWN, 0, 1, 2, 3], [2, 3, 4, 5, NO_UNKNOWN], [NO_UNKNOWN] * 5]
+
+
 def arrow(
-    batch: tuple[int, ...] = (), *, general: bool = True, n_extra: int = 2, n_own: int = 4, seed: int = 0
+    batch: tuple[int, ...] = (),
+    *,
+    index: list[list[int]] = INDEX,
+    n_extra: int = 2,
+    n_own: int = 4,
+    seed: int = 0,
 ) -> ArrowJacobian:
-    """Three segments of 8 rows that see 5 quantities of 6 shared unknowns."""
-    if general:
-        spread = random(3, 5, 6, seed=seed + 3, low=-1.0)
-    else:  # a one-hot row per unknown quantity, a zero row for a known one
-        index = torch.randint(0, 7, (3, 5), generator=torch.Generator().manual_seed(seed))
-        spread = torch.nn.functional.one_hot(index, 7)[..., :6].to(torch.float64)
+    """Three segments of 8 rows that see five shared columns each."""
     return ArrowJacobian(
         random(*batch, 3, 8, n_own, seed=seed, low=-1.0),
         random(*batch, 3, 8, 5, seed=seed + 1, low=-1.0),
         random(*batch, n_extra, 6, seed=seed + 2, low=-1.0),
-        spread,
+        torch.tensor(index),
     )
 
 
 JACOBIANS = {
     "dense": lambda batch: dense(batch),
     "arrow": lambda batch: arrow(batch),
-    "arrow_one_hot": lambda batch: arrow(batch, general=False),
+    "arrow_of_neighbours": lambda batch: arrow(batch, index=NEIGHBOURS),
     "arrow_without_extra_rows": lambda batch: arrow(batch, n_extra=0),
     "arrow_without_own_columns": lambda batch: arrow(batch, n_own=0),
 }
@@ -126,7 +132,8 @@ def test_a_rank_deficient_member_is_nan_by_cholesky_and_others_are_not(make):
 
 def test_dependent_shared_unknowns_are_nan_too():
     jacobian = arrow()
-    singular = ArrowJacobian(jacobian.local, jacobian.shared, 0 * jacobian.extra, 0 * jacobian.spread)
+    none = torch.full_like(jacobian.index, NO_UNKNOWN)
+    singular = ArrowJacobian(jacobian.local, jacobian.shared, 0 * jacobian.extra, none)
     residual, damping, scale = data(singular, ())
     assert torch.isnan(singular.solve_damped(residual, 0 * damping, scale, "cholesky")).any()
 
@@ -149,7 +156,11 @@ def test_an_arrow_without_coupling_is_block_diagonal():
     assert torch.equal(whole[:24, :12], local)
     assert torch.equal(whole[24:, 12:], jacobian.extra)
     assert not whole[24:, :12].any()
-    assert relative(whole[8:16, 12:], jacobian.shared[1] @ jacobian.spread[1]) < 1e-15
+    # the third segment sees 4, 5, 1, 5 and something known
+    shared = jacobian.shared[2]
+    assert torch.equal(whole[16:24, [16, 13]], shared[:, [0, 2]])
+    assert torch.equal(whole[16:24, 17], shared[:, 1] + shared[:, 3])
+    assert not whole[16:24, [12, 14, 15]].any()
 
 
 def test_an_unknown_method_is_a_key_error():
