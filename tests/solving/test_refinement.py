@@ -12,9 +12,10 @@ from ponn_torch.ansatz.basis import Chebyshev
 from ponn_torch.numerics.nodes import make_nodes
 from ponn_torch.optim.base import Status, Stopping
 from ponn_torch.optim.least_squares import LevenbergMarquardt
-from ponn_torch.optimal_control.collocation import Collocation, Discretisation
+from ponn_torch.optimal_control.collocation import Collocation
 from ponn_torch.optimal_control.control_laws import Regime
 from ponn_torch.optimal_control.curve import Curve
+from ponn_torch.optimal_control.discretisation import Discretisation
 from ponn_torch.optimal_control.pontryagin import Setting
 from ponn_torch.solving.guess import RandomGuess, project
 from ponn_torch.solving.refinement import Outcome, Split, Subdivide
@@ -61,9 +62,8 @@ def test_an_extremal_with_too_few_arcs_is_seen_by_the_sign_of_s():
     assert find_structure(curve).arcs.flatten().tolist() == [2, 0, 2, 0, 2]
 
 
-@pytest.mark.parametrize("max_rounds", [1, 3])
-def test_a_split_from_a_blunt_curve_is_right_or_says_that_it_is_not(max_rounds):
-    refined = Split(max_rounds=max_rounds).run(smoothed("earth_mars", 1.0))
+def test_a_split_from_a_blunt_curve_is_right_or_says_that_it_is_not():
+    refined = Split(max_rounds=3).run(smoothed("earth_mars", 1.0))
     if refined.outcome is Outcome.SOLVED:
         assert Solution(refined.curve).cost == pytest.approx(OPTIMA["earth_mars"], abs=1e-6)
         assert Solution(refined.curve).arcs == ["max", "min", "max", "min", "max"]
