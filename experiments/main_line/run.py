@@ -1,0 +1,44 @@
+"""The issue's numbers from the command line: run parts, write tables, hold them against expected.json."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+
+import torch
+
+from experiments.main_line import smoothed, split, starts, unsplit
+from experiments.tables import check, write
+
+FOLDER = Path(__file__).parent
+PARTS = {
+    "smoothed": smoothed.run,
+    "starts": starts.run,
+    "pointwise": unsplit.run_pointwise,
+    "weak": unsplit.run_weak,
+    "split": split.run,  # last: its times are quoted
+}
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--parts", nargs="+", choices=PARTS, default=list(PARTS), help="default: all of them")
+    parser.add_argument("--seeds", type=int, default=20, help="seeds 0 … SEEDS − 1 (default 20)")
+    parser.add_argument("--check-only", action="store_true", help="do not write results")
+    arguments = parser.parse_args()
+    if arguments.seeds < 1:
+        parser.error(f"--seeds {arguments.seeds}; allowed: at least 1")
+    torch.set_num_threads(1)
+    measured: dict[str, float] = {}
+    for part in arguments.parts:
+        report = PARTS[part](range(arguments.seeds))
+        print(f"\n{report.summary}\n", flush=True)
+        measured |= report.measured
+        if not arguments.check_only:
+            write(FOLDER, part, report)
+    return 0 if check(FOLDER, arguments.parts, measured) else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())
