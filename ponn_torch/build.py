@@ -109,16 +109,12 @@ def build_problem(node: Mapping[str, Any]) -> OptimalControlProblem:
         label = node.pop("name", None)
         reject_unknown(node, ["arguments"], path)
         if not isinstance(reference, str):
-            raise ConfigError(
-                f"{path}.reference = {reference!r}; allowed: 'module:function' or 'file.py:function'"
-            )
+            raise ConfigError(f"{path}.reference = {reference!r}; allowed: 'module:function' or 'file.py:function'")
         parameters: Sequence[str] = list(arguments)
         path = "problem.arguments"
     else:
         if "_target_" not in node:
-            raise ConfigError(
-                f"{path} = {short(node)}; allowed: a config of the group problem, or module:function"
-            )
+            raise ConfigError(f"{path} = {short(node)}; allowed: a config of the group problem, or module:function")
         function = target(node.pop("_target_"), f"{path}._target_", ROOMS[:1])
         arguments, label = arguments_of(function, node, path), node.get("name")
         reference, parameters = f"{function.__module__}:{function.__name__}", list(arguments)
@@ -199,9 +195,7 @@ def _rehearse(plan: Plan) -> None:
     """Derive the boundary value problem, tabulate the first stage, guess: names what does not go together."""
     solver = plan.solver
     try:
-        bvp = pontryagin(
-            plan.problem, mass_variable=solver.mass_variable, dtype=solver.dtype, device=solver.device
-        )
+        bvp = pontryagin(plan.problem, mass_variable=solver.mass_variable, dtype=solver.dtype, device=solver.device)
     except ValueError as error:
         raise ConfigError(located(error, "", ["mass_variable"], label="problem")) from error
     try:

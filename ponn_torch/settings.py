@@ -18,7 +18,7 @@ from ponn_torch.optimal_control.problem import nearest
 ROOMS = (
     "ponn_torch.problems",
     "ponn_torch.ansatz.basis",
-    "ponn_torch.optimal_control.collocation",
+    "ponn_torch.optimal_control.discretisation",
     "ponn_torch.optim",
     "ponn_torch.solving",
 )
@@ -119,10 +119,7 @@ def fit(value: Any, hint: Any, path: str) -> Any:
             return value
     elif origin is not None and issubclass(origin, Sequence):
         if isinstance(value, list | tuple):
-            return [
-                value_of(entry, options[0] if options else Any, f"{path}[{i}]")
-                for i, entry in enumerate(value)
-            ]
+            return [value_of(entry, options[0] if options else Any, f"{path}[{i}]") for i, entry in enumerate(value)]
     elif origin is type:
         if isinstance(value, str):
             value = target(value, path, ROOMS)
@@ -155,9 +152,7 @@ def _described(hint: Any) -> str:
 
 
 def short(value: Any) -> str:
-    text = one_line(
-        value if isinstance(value, type) or not hasattr(value, "__dict__") else type(value).__name__
-    )
+    text = one_line(value if isinstance(value, type) or not hasattr(value, "__dict__") else type(value).__name__)
     text = repr(value) if isinstance(value, str) else text
     return text if len(text) <= 60 else f"{text[:57]}..."
 

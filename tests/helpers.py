@@ -16,7 +16,8 @@ from ponn_torch.ansatz.basis import Chebyshev, GaussianRBF, Legendre, LinearBasi
 from ponn_torch.numerics.nodes import make_nodes
 from ponn_torch.optim.base import Optimizer, Stopping
 from ponn_torch.optim.least_squares import GaussNewton, LevenbergMarquardt, ScipyLeastSquares
-from ponn_torch.optimal_control.collocation import Collocation, Discretisation, Form, Strong
+from ponn_torch.optimal_control.collocation import Collocation
+from ponn_torch.optimal_control.discretisation import Discretisation, Form, Strong
 from ponn_torch.optimal_control.pontryagin import BoundaryValueProblem, pontryagin
 from ponn_torch.optimal_control.problem import OptimalControlProblem
 

@@ -134,9 +134,7 @@ def test_own_problem_with_a_wrong_name_or_argument(
 # -- runs ------------------------------------------------------------------------------------------
 
 
-def test_run_leaves_a_complete_folder_and_may_be_run_again(
-    capsys: pytest.CaptureFixture[str], tmp_path: Path
-) -> None:
+def test_run_leaves_a_complete_folder_and_may_be_run_again(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     folder = tmp_path / "run"
     arguments = ["problem=mars_landing", "seed=1", "record.stage_figures=false", f"hydra.run.dir='{folder}'"]
     assert main([*arguments, "continuation.values=[1.0,0.1,0.01]"]) == 0
@@ -232,9 +230,7 @@ def events_in_progress(records: Path) -> int:
 # -- sweeps and texts ------------------------------------------------------------------------------
 
 
-def test_sweep_counts_and_explains_members_that_fail(
-    capsys: pytest.CaptureFixture[str], tmp_path: Path
-) -> None:
+def test_sweep_counts_and_explains_members_that_fail(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     folder = tmp_path / "a sweep"
     masses = "problem.initial_mass=1905,-1,1900"
     assert main(["-m", *LANDING, masses, f"hydra.sweep.dir='{folder}'"]) == 1
@@ -248,9 +244,7 @@ def test_sweep_counts_and_explains_members_that_fail(
     assert "problem.initial_mass = -1" in (folder / "1" / "failure.txt").read_text(encoding="utf-8")
 
 
-def test_sweep_over_a_misspelt_config_does_not_begin(
-    capsys: pytest.CaptureFixture[str], tmp_path: Path
-) -> None:
+def test_sweep_over_a_misspelt_config_does_not_begin(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     folder = tmp_path / "sweep"
     assert main(["-m", "ansatz=chebyshev,elm_tnh", f"hydra.sweep.dir='{folder}'"]) == 1
     (line,) = capsys.readouterr().err.splitlines()

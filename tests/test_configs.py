@@ -20,9 +20,7 @@ from ponn_torch.solving.certificate import Certificate
 from ponn_torch.solving.solver import Solver
 
 CONFIGS = Path(__file__).resolve().parents[1] / "configs"
-OPTIONS = sorted(
-    (path.parent.name, path.stem) for path in CONFIGS.glob("*/*.yaml") if path.parent.name != "hydra"
-)
+OPTIONS = sorted((path.parent.name, path.stem) for path in CONFIGS.glob("*/*.yaml") if path.parent.name != "hydra")
 REFERENCE = "problem.reference='ponn_torch.problems.mars_landing:mars_landing'"
 
 
@@ -107,10 +105,7 @@ def test_known_optimum_belongs_to_the_published_data(problem: str, cost: float, 
     assert isinstance(found.final_time, FreeTime) is free
     assert built(f"problem={problem}", "problem.regulariser=quadratic").problem.known_cost == cost
     assert built(f"problem={problem}", "problem.initial_mass=1500").problem.known_cost is None
-    assert (
-        built(f"problem={problem}", "problem.initial_mass=1500", "problem.known_cost=3").problem.known_cost
-        == 3
-    )
+    assert built(f"problem={problem}", "problem.initial_mass=1500", "problem.known_cost=3").problem.known_cost == 3
 
 
 TINY = [

@@ -182,10 +182,7 @@ class RandomFeatures(LinearBasis):
 
         slope = DEFAULT_SLOPES[activation]
         weight = uniform("weight_range", (-slope, slope) if weight_range is None else weight_range)
-        if bias_range is None:
-            bias = -weight * uniform("centres", (-1.0, 1.0))
-        else:
-            bias = uniform("bias_range", bias_range)
+        bias = -weight * uniform("centres", (-1.0, 1.0)) if bias_range is None else uniform("bias_range", bias_range)
         self.register_buffer("weight", weight.to(device=device, dtype=dtype))
         self.register_buffer("bias", bias.to(device=device, dtype=dtype))
 
@@ -223,9 +220,7 @@ class GaussianRBF(LinearBasis):
         super().__init__(positions.shape[-1])
         shapes = torch.as_tensor(shape, dtype=dtype, device=device)
         if shapes.dim() and shapes.shape[-1] != self.size:
-            raise ValueError(
-                f"shape has {shapes.shape[-1]} entries; allowed: 1 or one per centre, {self.size}"
-            )
+            raise ValueError(f"shape has {shapes.shape[-1]} entries; allowed: 1 or one per centre, {self.size}")
         self.register_buffer("centres", positions)
         self.register_buffer("shape", shapes.repeat(self.size) if shapes.dim() == 0 else shapes)
 

@@ -194,9 +194,7 @@ def _switching_coefficients(constraints: Sequence[Constraint], n_variables: int)
     chosen = _independent_columns(columns)
     if len(chosen) < len(constraints):
         culprits = ", ".join(str(constraints[i]) for i in _dependent_rows(columns))
-        raise ValueError(
-            f"constraints = [{culprits}] clash: one follows from the rest; allowed: independent ones"
-        )
+        raise ValueError(f"constraints = [{culprits}] clash: one follows from the rest; allowed: independent ones")
     coefficients = columns.new_zeros(columns.shape[1], len(constraints))
     coefficients[chosen] = torch.linalg.inv(columns[:, chosen]) / scale
     n_degrees = 1 + max(chosen, default=0) // n_variables

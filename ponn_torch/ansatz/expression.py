@@ -170,9 +170,7 @@ class ConstrainedExpression(nn.Module):
         achieved = torch.stack(values, dim=-1)
         return (achieved.movedim(0, -1) if self.n_variables == 1 else achieved) - kappa
 
-    def fit(
-        self, z: Tensor, y: Tensor, kappa: Tensor, *, weights: Tensor | None = None, ridge: float = 0.0
-    ) -> Tensor:
+    def fit(self, z: Tensor, y: Tensor, kappa: Tensor, *, weights: Tensor | None = None, ridge: float = 0.0) -> Tensor:
         """β of the least-squares projection of values y (..., n, d) at z (n,), for given targets κ.
 
         Minimises Σ_i weights_i |y(z_i) - y_i|² + ridge |β|², weights (n,) by default 1, by the singular value

@@ -116,9 +116,7 @@ def run(config: DictConfig, folder: Path, overrides: Sequence[str], plan: Plan |
     except KeyboardInterrupt:
         outcome = _replaced(outcome, INTERRUPTED, "interrupted while the report was written")
         write_failure(folder, outcome.message)
-    _write_text(
-        folder / OUTCOME, json.dumps(finite_or_none(asdict(outcome)), indent=2, ensure_ascii=False) + "\n"
-    )
+    _write_text(folder / OUTCOME, json.dumps(finite_or_none(asdict(outcome)), indent=2, ensure_ascii=False) + "\n")
     print(_screen(outcome, folder, plan, keeper, time.process_time() - began), flush=True)
     return outcome
 

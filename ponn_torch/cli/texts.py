@@ -60,9 +60,7 @@ def config_groups() -> str:
     lines = []
     for name, options in _shown_groups().items():
         lines.append(name)
-        lines += [
-            f"  {option:24}{first_comment(config_folder() / name / f'{option}.yaml')}" for option in options
-        ]
+        lines += [f"  {option:24}{first_comment(config_folder() / name / f'{option}.yaml')}" for option in options]
     return "\n".join(lines)
 
 

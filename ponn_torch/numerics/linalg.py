@@ -165,7 +165,7 @@ class ArrowJacobian:
         return out
 
     def solve_damped(self, residual: Tensor, damping: Tensor, scale: Tensor, method: str = "cholesky") -> Tensor:
-        """Step p (..., N); the segments' own unknowns are eliminated first, K small factorisations and one of size G."""
+        """Step p (..., N); the segments' own unknowns are eliminated first: K small factorisations, one of size G."""
         return _METHODS[method][1](self, residual, damping[..., None, None], scale)
 
     def _split_columns(self, vector: Tensor) -> tuple[Tensor, Tensor]:
@@ -176,9 +176,7 @@ class ArrowJacobian:
         own, mixed, shared = self._normal
         scale_own, scale_shared = self._split_columns(scale)
         gradient_own, gradient_shared = self._split_columns(self.gradient(residual))
-        solved = _cholesky_solve(
-            own, scale_own, damping, torch.cat([mixed, gradient_own.unsqueeze(-1)], -1)
-        )
+        solved = _cholesky_solve(own, scale_own, damping, torch.cat([mixed, gradient_own.unsqueeze(-1)], -1))
         by_shared, by_residual = solved[..., :-1], solved[..., -1]
         schur = self._scatter_matrix(shared - mixed.mT @ by_shared) + self.extra.mT @ self.extra
         reduced = gradient_shared - self._scatter((mixed.mT @ by_residual.unsqueeze(-1)).squeeze(-1))

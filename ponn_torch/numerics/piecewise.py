@@ -75,6 +75,4 @@ def approximate(
             np.concatenate([middle[rough], right[rough]]),
         )
     done.sort(key=lambda panel: panel[0])
-    return PiecewiseChebyshev(
-        [float(a) for a, _, _ in done] + [float(end)], np.stack([c for _, _, c in done])
-    )
+    return PiecewiseChebyshev([float(a) for a, _, _ in done] + [float(end)], np.stack([c for _, _, c in done]))

@@ -27,9 +27,7 @@ def trace(function: Function, *examples: Tensor) -> Function:
         from torch.fx.passes.dialect.common.cse_pass import CSEPass
 
         graph = make_fx(function)(*examples)
-        if any(
-            getattr(getattr(node.target, "_schema", None), "is_mutable", False) for node in graph.graph.nodes
-        ):
+        if any(getattr(getattr(node.target, "_schema", None), "is_mutable", False) for node in graph.graph.nodes):
             return function
         graph = _fold(graph, examples)
         shared = CSEPass()(graph)
@@ -46,9 +44,7 @@ def trace(function: Function, *examples: Tensor) -> Function:
 def _agree(expected: Tensor, found: Tensor) -> bool:
     if expected.shape != found.shape:
         return False
-    return torch.allclose(
-        expected, found, rtol=1e-12, atol=1e-13 * float(expected.abs().sum()), equal_nan=True
-    )
+    return torch.allclose(expected, found, rtol=1e-12, atol=1e-13 * float(expected.abs().sum()), equal_nan=True)
 
 
 class _Recorder(fx.Interpreter):
@@ -74,9 +70,7 @@ def _fold(module: fx.GraphModule, examples: tuple[Tensor, ...]) -> fx.GraphModul
             constant.add(node)
         elif node.op == "call_function" and isinstance(values[node], Tensor):
             name = node.name.rstrip("_0123456789")
-            if node.name.startswith(_FILLERS) or (
-                node.all_input_nodes and constant.issuperset(node.all_input_nodes)
-            ):
+            if node.name.startswith(_FILLERS) or (node.all_input_nodes and constant.issuperset(node.all_input_nodes)):
                 constant.add(node)
             elif name in (
                 "expand",

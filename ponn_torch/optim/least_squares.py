@@ -17,6 +17,7 @@ from ponn_torch.numerics.linalg import LINEAR_SOLVERS, Jacobian
 from ponn_torch.optim.base import (
     Callback,
     OptimizeResult,
+    Record,
     Residual,
     Status,
     Stopping,
@@ -38,7 +39,7 @@ def _check_solver(linear_solver: str) -> None:
         raise ValueError(f"linear_solver = {linear_solver!r}; allowed: {', '.join(LINEAR_SOLVERS)}")
 
 
-# -- scalings D of the damping ‖√μ D p‖ -------------------------------------------------------------------------------------
+# -- scalings D of the damping ‖√μ D p‖ ------------------------------------------------------------------------------
 
 
 def marquardt(norms: Tensor, previous: Tensor | None) -> Tensor:
@@ -59,7 +60,7 @@ def identity(norms: Tensor, previous: Tensor | None) -> Tensor:
 SCALINGS = {"marquardt": marquardt, "more": more, "identity": identity}
 
 
-# -- Levenberg–Marquardt ------------------------------------------------------------------------------------------------------
+# -- Levenberg–Marquardt ---------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -104,7 +105,8 @@ class LevenbergMarquardt:
         growth = torch.full_like(cost, 2.0)
         code = torch.full(cost.shape, _RUNNING, dtype=torch.long, device=cost.device)
         slow = torch.zeros_like(code)
-        records, n_residuals, n_linear = [], 0, 1
+        records: list[Record] = []
+        n_residuals, n_linear = 0, 1
         code = torch.where(cost.sqrt() < rule.tolerance, _code(Status.RESIDUAL), code)
         interrupted = False
         while bool((code == _RUNNING).any()):
@@ -165,9 +167,7 @@ class LevenbergMarquardt:
             except KeyboardInterrupt:
                 interrupted = True
                 break
-        members = tuple(
-            Status.INTERRUPTED if c == _RUNNING else _CODES[c] for c in code.flatten().tolist()
-        )
+        members = tuple(Status.INTERRUPTED if c == _RUNNING else _CODES[c] for c in code.flatten().tolist())
         return OptimizeResult(
             xi=xi,
             norm=cost.sqrt(),
@@ -222,7 +222,7 @@ class GaussNewton:
         return inner.run(residual, xi, on_iteration)
 
 
-# -- SciPy ----------------------------------------------------------------------------------------------------------------------
+# -- SciPy -----------------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -239,7 +239,8 @@ class ScipyLeastSquares:
     def run(self, residual: Residual, xi: Tensor, on_iteration: Callback | None = None) -> OptimizeResult:
         if xi.dim() != 1:
             raise ValueError(f"xi has shape {tuple(xi.shape)}; scipy solves one problem, shape (N,), at a time")
-        rule, watch, records = self.stopping, Stopwatch(), []
+        rule, watch = self.stopping, Stopwatch()
+        records: list[Record] = []
         check_start(residual, residual.residual(xi))
         count = {"residuals": 0, "linearisations": 0}
         best: list[tuple[float, Tensor]] = [(float("inf"), xi)]
@@ -258,8 +259,15 @@ class ScipyLeastSquares:
                 best[0] = (norm, point)
             records.append(
                 record(
-                    iteration=len(records) + 1, norm=best[0][0], damping=0.0, step=0.0, accepted=improved, running=1,
-                    residuals=count["residuals"], linearisations=count["linearisations"], seconds=watch.seconds,
+                    iteration=len(records) + 1,
+                    norm=best[0][0],
+                    damping=0.0,
+                    step=0.0,
+                    accepted=improved,
+                    running=1,
+                    residuals=count["residuals"],
+                    linearisations=count["linearisations"],
+                    seconds=watch.seconds,
                 )
             )
             if on_iteration is not None:

@@ -11,165 +11,19 @@ terminal manifold.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import torch
 from torch import Tensor
 from torch.func import vjp, vmap
 
-from ponn_torch.ansatz.basis import LinearBasis
-from ponn_torch.ansatz.constraints import hermite
-from ponn_torch.ansatz.expression import ConstrainedExpression
 from ponn_torch.numerics.linalg import ArrowJacobian
-from ponn_torch.numerics.nodes import NodeSet, legendre_moments
-from ponn_torch.optimal_control.control_laws import INTERIOR, Regime
-from ponn_torch.optimal_control.pontryagin import BoundaryValueProblem, Setting, probe_points, probe_settings
+from ponn_torch.optimal_control.control_laws import Regime
+from ponn_torch.optimal_control.discretisation import Discretisation, Group
+from ponn_torch.optimal_control.linearisation import linearise
+from ponn_torch.optimal_control.pontryagin import BoundaryValueProblem, Setting
 from ponn_torch.optimal_control.problem import Named
-
-
-# -- test functions: how the pointwise residual becomes rows --------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class Strong:
-    """Pointwise rows √w_i R(z_i), so that their sum of squares is the integral of R²."""
-
-    def matrix(self, nodes: NodeSet) -> Tensor:
-        return torch.diag(nodes.weights.sqrt())
-
-
-@dataclass(frozen=True)
-class Weak:
-    """Moments ⟨R, P_k⟩/(1+k)^decay with orthonormal Legendre P_k, k < n_moments (all nodes if None).
-
-    A residual with a jump has slowly falling moments; the decay keeps them from governing the fit.
-    """
-
-    decay: float = 1.0
-    n_moments: int | None = None
-
-    def matrix(self, nodes: NodeSet) -> Tensor:
-        moments = legendre_moments(nodes, self.n_moments or len(nodes))
-        degree = torch.arange(1, moments.shape[0] + 1, dtype=moments.dtype, device=moments.device)
-        return moments / degree.unsqueeze(-1) ** self.decay
-
-
-Form = Strong | Weak
-
-
-# -- tables: all that does not depend on unknowns -------------------------------------------------------------------------
-
-
-@dataclass(frozen=True, eq=False)
-class Group:
-    """Chains of one length that share tables; a trivial one has no free function.
-
-    columns (d, q) of w, factors (d, q): y^(e) = factors[e] w[columns[e]]; table (L + 2q, (q+1) n) gives all derivatives
-    at all nodes from [β, κ] in one product; own and rows locate β and the equations inside a segment.
-    """
-
-    order: int
-    trivial: bool
-    columns: Tensor
-    factors: Tensor
-    expression: ConstrainedExpression
-    size: int
-    B: Tensor
-    Omega: Tensor
-    table: Tensor
-    test: Tensor
-    own: slice
-    rows: slice
-
-    @property
-    def n_chains(self) -> int:
-        return self.columns.shape[0]
-
-
-@dataclass(frozen=True, eq=False)
-class Discretisation:
-    """Basis, nodes and form, tabulated for the chains of a boundary value problem; shared by all its residuals."""
-
-    bvp: BoundaryValueProblem
-    basis: LinearBasis
-    nodes: NodeSet
-    form: Form = field(default_factory=Strong)
-    conditioning: str = "orthonormal"
-
-    @cached_property
-    def groups(self) -> tuple[Group, ...]:
-        bvp, nodes = self.bvp, self.nodes
-        like, out, own, rows = nodes.points, [], 0, 0
-        for order, trivial in sorted({(len(c.columns), c.trivial) for c in bvp.chains}):
-            chains = [c for c in bvp.chains if (len(c.columns), c.trivial) == (order, trivial)]
-            options = {"dtype": like.dtype, "device": like.device}
-            expression = ConstrainedExpression(
-                self.basis.beyond(2 * order),
-                hermite(order),
-                nodes=nodes,
-                order=order,
-                conditioning=self.conditioning,
-                **options,
-            )
-            B, Omega = expression.tables(like, order)
-            # a trivial chain is the Hermite interpolant, of degree 2q−1: y^(q) = 0 has q coefficients to be met
-            test = legendre_moments(nodes, order) if trivial else self.form.matrix(nodes)
-            B = B[..., :0] if trivial else B
-            size = B.shape[-1]
-            own_end, rows_end = own + len(chains) * size, rows + len(chains) * test.shape[0]
-            out.append(
-                Group(
-                    order=order,
-                    trivial=trivial,
-                    columns=torch.tensor([c.columns for c in chains], device=like.device),
-                    factors=torch.tensor([c.factors for c in chains], **options),
-                    expression=expression,
-                    size=size,
-                    B=B,
-                    Omega=Omega,
-                    table=torch.cat([B, Omega], -1).movedim(-1, 0).flatten(1),
-                    test=test,
-                    own=slice(own, own_end),
-                    rows=slice(rows, rows_end),
-                )
-            )
-            own, rows = own_end, rows_end
-        return tuple(out)
-
-    @property
-    def n_own(self) -> int:
-        """Coefficients per segment."""
-        return self.groups[-1].own.stop
-
-    @property
-    def n_rows(self) -> int:
-        """Equations per segment."""
-        return self.groups[-1].rows.stop
-
-    @cached_property
-    def order_of_columns(self) -> Tensor:
-        """Permutation from [group, derivative, chain] to the columns of w."""
-        columns = torch.cat([g.columns.mT.flatten() for g in self.groups])
-        return torch.argsort(columns)
-
-    @cached_property
-    def last_columns(self) -> Tensor:
-        """Columns of F that the non-trivial chains' equations use, in the order of the groups."""
-        none = torch.zeros(0, dtype=torch.long, device=self.nodes.points.device)
-        return torch.cat([none, *(g.columns[:, -1] for g in self.groups if not g.trivial)])
-
-    @cached_property
-    def couplings(self) -> Tensor:
-        """Boolean (2n, 2n): F_i depends on w_j, found at random points."""
-        bvp, found = self.bvp, []
-        t, w = probe_points(bvp, 16, seed=1)
-        seeds = torch.eye(bvp.dimension, dtype=w.dtype, device=w.device)
-        for setting in probe_settings(bvp, t):
-            rates, pull = vjp(lambda w, setting=setting: bvp.rates(t, w, setting), w)
-            by_w = vmap(lambda seed, rates=rates, pull=pull: pull(seed.expand_as(rates))[0])(seeds)
-            found.append(by_w.abs().amax(1) > 0)
-        return torch.stack(found).any(0)
 
 
 @dataclass(frozen=True)
@@ -182,7 +36,7 @@ class Unknowns:
     multipliers: Tensor
 
 
-# -- the residual ---------------------------------------------------------------------------------------------------------
+# -- the residual ----------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, eq=False)
@@ -226,7 +80,10 @@ class Collocation:
         """The same residual at another smoothing or other values of named parameters."""
         regime, values = self.setting.regime, dict(self.setting.parameters)
         if smoothing is not None:
-            regime = replace(regime, smoothing=torch.as_tensor(smoothing, dtype=self.known_times.dtype).to(self.known_times))
+            regime = replace(
+                regime,
+                smoothing=torch.as_tensor(smoothing, dtype=self.known_times.dtype).to(self.known_times),
+            )
         for name, value in parameters.items():
             if name not in values:
                 raise ValueError(f"no parameter named {name!r}; allowed: smoothing, {', '.join(values)}")
@@ -314,9 +171,9 @@ class Collocation:
             -1,
         )
 
-    # -- evaluation at the nodes ----------------------------------------------------------------------------------------
+    # -- evaluation at the nodes -------------------------------------------------------------------------------------
 
-    def _kappa(self, group: Group, unknowns: Unknowns, h: Tensor) -> tuple[Tensor, Tensor]:
+    def kappa(self, group: Group, unknowns: Unknowns, h: Tensor) -> tuple[Tensor, Tensor]:
         """Targets κ (..., K, d, 2q) in units of z and the factors (..., K, d, 2q) that made them from knot values."""
         powers = torch.arange(group.order, dtype=h.dtype, device=h.device)
         factors = group.factors * h[..., None, None] ** powers
@@ -325,12 +182,12 @@ class Collocation:
         factors = torch.cat([factors, factors], -1)
         return both * factors, factors
 
-    def _jets(self, unknowns: Unknowns, h: Tensor) -> tuple[list[Tensor], list[Tensor], list[Tensor]]:
+    def jets(self, unknowns: Unknowns, h: Tensor) -> tuple[list[Tensor], list[Tensor], list[Tensor]]:
         """Per group the derivatives in z (..., K, d, q+1, n), κ, and the factors of κ."""
         jets, kappas, factors = [], [], []
         n = len(self.discretisation.nodes)
         for group in self.discretisation.groups:
-            kappa, factor = self._kappa(group, unknowns, h)
+            kappa, factor = self.kappa(group, unknowns, h)
             beta = unknowns.weights[..., group.own].unflatten(-1, (group.n_chains, group.size))
             jet = torch.cat([beta, kappa], -1) @ group.table
             jets.append(jet.unflatten(-1, (group.order + 1, n)))
@@ -338,18 +195,18 @@ class Collocation:
             factors.append(factor)
         return jets, kappas, factors
 
-    def _assemble(self, pieces: Sequence[Tensor]) -> Tensor:
+    def assemble(self, pieces: Sequence[Tensor]) -> Tensor:
         """Columns [group, derivative, chain] (..., K, ·, n) → w (..., K, n, 2n)."""
         return torch.cat(list(pieces), -2)[..., self.discretisation.order_of_columns, :].mT
 
-    def _points(self, jets: Sequence[Tensor], times: Tensor, h: Tensor) -> tuple[Tensor, Tensor]:
+    def points(self, jets: Sequence[Tensor], times: Tensor, h: Tensor) -> tuple[Tensor, Tensor]:
         """(t (..., K, n, 1), w (..., K, n, 2n)) at the nodes."""
         pieces = []
         for group, jet in zip(self.discretisation.groups, jets, strict=True):
             for e in range(group.order):
                 pieces.append(jet[..., e, :] / (h[..., None] ** e * group.factors[:, e])[..., None])
         t = times[..., :-1, None] + h[..., None] * (self.discretisation.nodes.points + 1.0)
-        return t.unsqueeze(-1), self._assemble(pieces)
+        return t.unsqueeze(-1), self.assemble(pieces)
 
     def point_setting(self, shape: Sequence[int]) -> Setting:
         """The setting spread over points of batch × segments × nodes shape, flattened."""
@@ -364,7 +221,7 @@ class Collocation:
             arcs = regime.arcs.unsqueeze(-2).expand(*shape, regime.arcs.shape[-1]).reshape(-1, regime.arcs.shape[-1])
         return Setting(Regime(smoothing, arcs), {k: spread(v) for k, v in self.setting.parameters.items()})
 
-    def _equations(self, jets: Sequence[Tensor], h: Tensor, rates: Tensor) -> Tensor:
+    def equations(self, jets: Sequence[Tensor], h: Tensor, rates: Tensor) -> Tensor:
         """Rows (..., K, n_rows): test functions applied to y^(q) − h^q F."""
         rows = []
         for group, jet in zip(self.discretisation.groups, jets, strict=True):
@@ -381,10 +238,10 @@ class Collocation:
         """r (..., R): the segments' equations, then switching rows S(t_k) = 0, then terminal rows."""
         unknowns = self.unpack(xi)
         h = (unknowns.times[..., 1:] - unknowns.times[..., :-1]) / 2
-        jets, _, _ = self._jets(unknowns, h)
-        t, w = self._points(jets, unknowns.times, h)
+        jets, _, _ = self.jets(unknowns, h)
+        t, w = self.points(jets, unknowns.times, h)
         rates = self.bvp.rates(t.reshape(-1, 1), w.reshape(-1, w.shape[-1]), self.point_setting(t.shape[:-1]))
-        equations = self._equations(jets, h, rates.view(w.shape))
+        equations = self.equations(jets, h, rates.view(w.shape))
         extra = self._extra_rows(unknowns.knots, unknowns.times, unknowns.multipliers)
         rows = torch.cat([equations.flatten(-2), extra], -1)
         # segments must keep their order: a step that turns one around is to be rejected
@@ -394,7 +251,7 @@ class Collocation:
         """Running cost (...,) by the nodes' quadrature plus terminal cost, in the user's units: quick, for progress."""
         bvp, unknowns = self.bvp, self.unpack(xi)
         h = (unknowns.times[..., 1:] - unknowns.times[..., :-1]) / 2
-        t, w = self._points(self._jets(unknowns, h)[0], unknowns.times, h)
+        t, w = self.points(self.jets(unknowns, h)[0], unknowns.times, h)
         setting = self.point_setting(t.shape[:-1])
         rate = bvp.running_cost(t.reshape(-1, 1), w.reshape(-1, w.shape[-1]), setting).view(t.shape[:-1])
         total = bvp.cost_unit * (h * (rate @ self.discretisation.nodes.weights)).sum(-1)
@@ -405,149 +262,12 @@ class Collocation:
         return total
 
     def linearise(self, xi: Tensor) -> tuple[Tensor, ArrowJacobian]:
-        """(r, J): pointwise cotangents of F by vmapped vjp, pulled back through the tables."""
-        disc, bvp = self.discretisation, self.bvp
-        unknowns = self.unpack(xi)
-        h = (unknowns.times[..., 1:] - unknowns.times[..., :-1]) / 2
-        jets, kappas, factors = self._jets(unknowns, h)
-        t, w = self._points(jets, unknowns.times, h)
-        rates, slopes_t, slopes_w = self._rates_and_slopes(t, w)
-        equations = self._equations(jets, h, rates)
-
-        n, k = len(disc.nodes), self.n_segments
-        batch = xi.shape[:-1]
-        local = xi.new_zeros(*batch, k, disc.n_rows, disc.n_own)
-        shared = xi.new_zeros(*batch, k, disc.n_rows, 2 * bvp.dimension + 2)
-        by_h = self._by_half_length(jets, kappas, h, rates, slopes_t, slopes_w)
-        first = 0
-        for group, stretch in zip(disc.groups, by_h, strict=True):
-            cotangents = None
-            scale = h[..., None] ** group.order * group.factors[:, -1]
-            if not group.trivial:
-                here = slice(first, first + group.n_chains)
-                first += group.n_chains
-                # −h^q F_w for this group's equations, (..., K, n, d, 2n)
-                cotangents = -scale[..., None, :, None] * slopes_w[..., here, :]
-            self._pull_back(group, cotangents, h, factors, local, shared)
-            rows = shared[..., group.rows, -2:]
-            motion = stretch
-            by_start = torch.zeros_like(motion)
-            if not group.trivial:
-                by_start = -scale[..., None] * slopes_t[..., here].mT
-            # h = (t₁ − t₀)/2 and t = t₀ + h (z + 1): what depends on t apart from h moves with t₀
-            by_start, by_end = by_start - 0.5 * motion, 0.5 * motion
-            f, g = (fraction[:, None, None] for fraction in self._end_fractions)
-            anchors = torch.stack([(1 - f) * by_start + (1 - g) * by_end, f * by_start + g * by_end], -1)
-            rows.copy_((group.test @ anchors).flatten(-3, -2))
-        extra_value, extra = self._extra_linearised(unknowns)
-        residual = torch.cat([equations.flatten(-2), extra_value], -1)
-        return residual, ArrowJacobian(local, shared, extra, self._shared_index)
-
-    def _rates_and_slopes(self, t: Tensor, w: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """F (..., 2n) and, for the equations in use, ∂F/∂t (..., rows) and ∂F/∂w (..., rows, 2n)."""
-        shape = w.shape
-        setting = self.point_setting(shape[:-1])
-        rates, pull = vjp(lambda a, b: self.bvp.rates(a, b, setting), t.reshape(-1, 1), w.reshape(-1, shape[-1]))
-        rows = self.discretisation.last_columns
-        if not len(rows):
-            return rates.view(shape), w[..., :0], w.unsqueeze(-2)[..., :0, :]
-        seeds = torch.zeros(len(rows), shape[-1], dtype=w.dtype, device=w.device)
-        seeds[torch.arange(len(rows)), rows] = 1.0
-        by_t, by_w = vmap(lambda seed: pull(seed.expand_as(rates)))(seeds)
-        return (
-            rates.view(shape),
-            by_t[..., 0].movedim(0, -1).reshape(*shape[:-1], len(rows)),
-            by_w.movedim(0, -2).reshape(*shape[:-1], len(rows), shape[-1]),
-        )
-
-    def _by_half_length(
-        self,
-        jets: Sequence[Tensor],
-        kappas: Sequence[Tensor],
-        h: Tensor,
-        rates: Tensor,
-        slopes_t: Tensor,
-        slopes_w: Tensor,
-    ) -> list[Tensor]:
-        """Derivative of each group's pointwise equations (..., K, d, n) with respect to h at fixed β and knots."""
-        disc, first = self.discretisation, 0
-        moved, tops = [], []
-        for group, jet, kappa in zip(disc.groups, jets, kappas, strict=True):
-            e = torch.arange(group.order, dtype=h.dtype, device=h.device).repeat(2)
-            by_h = torch.einsum("onk,...dk->...don", group.Omega, e * kappa) / h[..., None, None, None]
-            for e in range(group.order):
-                scale = (h[..., None] ** e * group.factors[:, e])[..., None]
-                moved.append((by_h[..., e, :] - e * jet[..., e, :] / h[..., None, None]) / scale)
-            tops.append(by_h[..., -1, :])
-        w_by_h = self._assemble(moved)
-        t_by_h = self.discretisation.nodes.points + 1.0
-        total = (slopes_w @ w_by_h.unsqueeze(-1)).squeeze(-1) + slopes_t * t_by_h[:, None]
-        out = []
-        for group, top in zip(disc.groups, tops, strict=True):
-            if group.trivial:
-                out.append(top)
-                continue
-            here = slice(first, first + group.n_chains)
-            first += group.n_chains
-            q, scale = group.order, h[..., None] ** group.order * group.factors[:, -1]
-            change = q / h[..., None, None] * rates[..., group.columns[:, -1]].mT + total[..., here].mT
-            out.append(top - scale[..., None] * change)
-        return out
-
-    def _pull_back(
-        self,
-        group: Group,
-        cotangents: Tensor | None,
-        h: Tensor,
-        kappa_factors: Sequence[Tensor],
-        local: Tensor,
-        shared: Tensor,
-    ) -> None:
-        """Fill this group's rows of ``local`` and ``shared`` from ∂(pointwise equations)/∂w (..., K, n, d, 2n)."""
-        disc, strong = self.discretisation, isinstance(self.discretisation.form, Strong) and not group.trivial
-        root = group.test.diagonal() if strong else None
-
-        def tested(pointwise: Tensor) -> Tensor:
-            """Apply the test functions along the node axis of (..., d, n, ·)."""
-            return pointwise * root[:, None] if root is not None else group.test @ pointwise
-
-        for other, factor in zip(disc.groups, kappa_factors, strict=True):
-            q, size, n_kappa = other.order, other.size, 2 * other.order
-            by_kappa = 0.0
-            target = local[..., group.rows, other.own]
-            target = target.unflatten(-2, (group.n_chains, -1)).unflatten(-1, (other.n_chains, size))
-            if cotangents is not None:
-                active = disc.couplings[group.columns[:, -1]][:, other.columns].any(0).any(0)
-                for e in [e for e in range(q) if bool(active[e])]:
-                    c = cotangents[..., other.columns[:, e]] / (h[..., None] ** e * other.factors[:, e])[..., None, None, :]
-                    c = c.transpose(-3, -2)  # (..., K, d, n, d')
-                    if root is not None:
-                        c = c * root[:, None]
-                        if size:
-                            target.addcmul_(c.unsqueeze(-1), other.B[e].unsqueeze(-2))
-                        by_kappa = by_kappa + c.unsqueeze(-1) * other.Omega[e].unsqueeze(-2)
-                    else:
-                        if size:
-                            block = (c.unsqueeze(-1) * other.B[e].unsqueeze(-2)).flatten(-2)
-                            target.add_((group.test @ block).unflatten(-1, (other.n_chains, size)))
-                        block = (c.unsqueeze(-1) * other.Omega[e].unsqueeze(-2)).flatten(-2)
-                        by_kappa = by_kappa + (group.test @ block).unflatten(-1, (other.n_chains, n_kappa))
-            if other is group:
-                if size:
-                    target.diagonal(dim1=-4, dim2=-2).add_(tested(group.B[q]).unsqueeze(-1))
-                if not isinstance(by_kappa, Tensor):
-                    shape = (*target.shape[:-1], n_kappa)
-                    by_kappa = torch.zeros(shape, dtype=target.dtype, device=target.device)
-                by_kappa.diagonal(dim1=-4, dim2=-2).add_(tested(group.Omega[q]).unsqueeze(-1))
-            if isinstance(by_kappa, Tensor):
-                by_knot = by_kappa * factor[..., None, None, :, :]
-                left = other.columns
-                index = torch.cat([left, left + self.bvp.dimension], -1).flatten()
-                shared[..., group.rows, index] = by_knot.flatten(-4, -3).flatten(-2)
+        """(r, J), exact; see linearisation.py."""
+        return linearise(self, xi)
 
     @cached_property
-    def _shared_index(self) -> Tensor:
-        """(K, S): where a segment's [left knot, right knot, anchor before, anchor after] stand among the shared unknowns."""
+    def shared_index(self) -> Tensor:
+        """(K, S): where a segment's [left knot, right knot, anchors around it] stand among the shared unknowns."""
         k, width, device = self.n_segments, self.bvp.dimension, self.known_times.device
         n_knots, n_times = len(self.free_knots), len(self.free_times)
         knots = torch.full(((k + 1) * width,), self.n_shared, device=device)
@@ -564,13 +284,15 @@ class Collocation:
         return self._anchors[0, :-1], self._anchors[1, 1:]
 
     @cached_property
-    def _end_fractions(self) -> tuple[Tensor, Tensor]:
+    def end_fractions(self) -> tuple[Tensor, Tensor]:
         """How far the two ends of every segment (K,) lie between its anchors."""
         fractions = self._fractions
         # the end of a segment that is an anchor is the anchor after it, not the one before the next
-        return fractions[:-1], torch.where(self._anchors[1, 1:] == self._anchors[0, 1:], torch.ones_like(fractions[1:]), fractions[1:])
+        return fractions[:-1], torch.where(
+            self._anchors[1, 1:] == self._anchors[0, 1:], torch.ones_like(fractions[1:]), fractions[1:]
+        )
 
-    # -- rows that see knots, times and multipliers only ----------------------------------------------------------------
+    # -- rows that see knots, times and multipliers only -------------------------------------------------------------
 
     @property
     def switch_knots(self) -> list[int]:
@@ -598,13 +320,13 @@ class Collocation:
             rows.append(self.bvp.terminal_rows(t, w, multipliers, Setting(Regime(smoothing, arcs), parameters)))
         return torch.cat(rows, -1) if rows else times[..., :0]
 
-    def _extra_linearised(self, unknowns: Unknowns) -> tuple[Tensor, Tensor]:
+    def extra_linearised(self, unknowns: Unknowns) -> tuple[Tensor, Tensor]:
         """Extra rows (..., E) and their derivative with respect to the shared unknowns (..., E, G)."""
         knots, times, multipliers = unknowns.knots, unknowns.times, unknowns.multipliers
         batch = times.shape[:-1]
         if not self.n_extra:
             return times[..., :0], times.new_zeros(*batch, 0, self.n_shared)
-        value, pull = vjp(self._extra_rows, knots, times, multipliers)
+        value, pull, *_ = vjp(self._extra_rows, knots, times, multipliers)
         seeds = torch.eye(self.n_extra, dtype=times.dtype, device=times.device)
         by_knots, by_times, by_multipliers = vmap(lambda seed: pull(seed.expand_as(value)))(seeds)
         jacobian = torch.cat(
@@ -618,7 +340,7 @@ class Collocation:
         return value, jacobian.movedim(0, -2)
 
     def blocks(self, residual: Tensor) -> Mapping[str, Tensor]:
-        """Norm of each equation (...,) by name, from r (..., R): d/dt of the chains' last entries, switching, terminal."""
+        """Norm of each equation (...,) by name, from r (..., R): the chains' last entries, switching, terminal."""
         disc, names = self.discretisation, component_names(self.bvp)
         k, rows = self.n_segments, disc.n_rows
         segments, extra = residual[..., : k * rows].unflatten(-1, (k, rows)), residual[..., k * rows :]

@@ -268,7 +268,8 @@ class Bounded:
 
 @dataclass(frozen=True)
 class ThrustBall(Bounded):
-    """A vector with minimum ≤ |T| ≤ maximum; dynamics read ``u.<name>`` (..., size) and ``u.<name>_magnitude`` (..., 1).
+    """A vector with minimum ≤ |T| ≤ maximum; dynamics read ``u.<name>`` (..., size) and ``u.<name>_magnitude`` (...,
+    1).
 
     The two enter the Hamiltonian as independent arguments, H linear in the vector, so that no norm is differentiated:
     the direction is −primer/|primer| with primer = ∂H/∂vector, and S = (|primer| − ∂H/∂magnitude)/cost_rate
@@ -293,7 +294,7 @@ class ThrustBall(Bounded):
 
     def adapted(self, h: Hamiltonian, cost: Hamiltonian, p: Any, one: Tensor, unit: float) -> ThrustBall:
         low, high = (torch.as_tensor(b, dtype=one.dtype) for b in self.bounds(p))
-        if not bool(((0 <= low) & (low < high)).all()):
+        if not bool(((low >= 0) & (low < high)).all()):
             raise ValueError(f"{self.name}: minimum = {self.minimum}, maximum = {self.maximum}; 0 ≤ minimum < maximum")
         zero = torch.zeros_like(one)
         vector = zero.expand(*one.shape[:-1], self.size)
@@ -322,7 +323,7 @@ class ThrustBall(Bounded):
 
 @dataclass(frozen=True)
 class Box(Bounded):
-    """Components with minimum ≤ u_i ≤ maximum, each entering H apart from the others (affine, or convex and separable)."""
+    """Components with minimum ≤ u_i ≤ maximum, each entering H apart from the others, affine or convex."""
 
     size: int = 1
 

@@ -47,10 +47,16 @@ class Curve:
         unknowns, out = self.unknowns, []
         h = (self.times[1:] - self.times[:-1]) / 2
         for group in self.collocation.discretisation.groups:
-            kappa, _ = self.collocation._kappa(group, unknowns, h)
+            kappa, _ = self.collocation.kappa(group, unknowns, h)
             beta = unknowns.weights[segment, group.own].unflatten(-1, (group.n_chains, group.size))
             B, Omega = group.expression.tables(z, group.order)
-            out.append(torch.einsum("omk,dk->dom", torch.cat([B[..., : group.size], Omega], -1), torch.cat([beta, kappa[segment]], -1)))
+            out.append(
+                torch.einsum(
+                    "omk,dk->dom",
+                    torch.cat([B[..., : group.size], Omega], -1),
+                    torch.cat([beta, kappa[segment]], -1),
+                )
+            )
         return out
 
     def on_segment(self, z: Tensor, segment: int) -> tuple[Tensor, Tensor, Tensor]:

@@ -154,8 +154,8 @@ class BoundaryValueProblem:
         """The Hamiltonian (..., 1) that the setting's law minimises, regulariser included, in cost_unit/time_unit."""
         x, costates = self.to_physical(w)
         p, best = Named(**setting.parameters), self.minimiser(t, w, setting)
-        # at the minimiser H is stationary in the control, so its derivative is that at fixed control; through a saturated
-        # η it would be 0 · ∞
+        # at the minimiser H is stationary in the control, so its derivative is that at fixed control; through a
+        # saturated η it would be 0 · ∞
         best = Minimiser({k: v.detach() for k, v in best.control.items()}, best.switching, best.fraction.detach())
         h = self._hamiltonian(t * self.time_unit, x, costates, Named(**best.control), p)[0]
         if setting.regime.smoothing is not None and setting.regime.arcs is None:
@@ -201,7 +201,7 @@ class BoundaryValueProblem:
                 total = total + self.cost_unit * (multipliers * psi).sum(-1)
             return total, psi
 
-        (_, psi), pull = vjp(end_function, time, x)
+        (_, psi), pull, *_ = vjp(end_function, time, x)
         phi_t, phi_x = pull((torch.ones_like(time[..., 0]), torch.zeros_like(psi)))
         if self.terminal_components:
             index = self.terminal_components
@@ -214,7 +214,7 @@ class BoundaryValueProblem:
         return torch.cat(rows, -1) if rows else w[..., :0]
 
 
-# -- building ------------------------------------------------------------------------------------------------------------
+# -- building --------------------------------------------------------------------------------------------------------
 
 
 def pontryagin(
@@ -268,7 +268,8 @@ def pontryagin(
 
 def _boundary(bvp: BoundaryValueProblem) -> dict[str, Any]:
     """Known ends of w, scaled: given states; zero costates where a state is free and nothing is paid for it."""
-    problem, out = bvp.problem, {}
+    problem = bvp.problem
+    out: dict[str, Any] = {}
     fixed_by_rows = set(bvp.terminal_components)
     for end in ("initial", "final"):
         values = problem.boundary(end)
@@ -276,8 +277,8 @@ def _boundary(bvp: BoundaryValueProblem) -> dict[str, Any]:
         if bool(((bvp.exponent != 0) & (like <= 0)).any()):
             raise ValueError(f"{problem.name}: {end} mass must be positive for mass_variable={bvp.mass_variable!r}")
         w = bvp.to_scaled(like, torch.zeros_like(like))
-        for i, value in enumerate(values):
-            if value is None:
+        for i, known in enumerate(values):
+            if known is None:
                 w[i] = torch.nan
                 if end == "final" and i in fixed_by_rows:
                     w[bvp.n_states + i] = torch.nan
@@ -285,7 +286,10 @@ def _boundary(bvp: BoundaryValueProblem) -> dict[str, Any]:
                 w[bvp.n_states + i] = torch.nan
         out[f"known_{end}"] = w
     if problem.terminal_manifold is not None:
-        one, p = probe_points(bvp, 2)[0], Named(**{k: torch.full((2, 1), v) for k, v in problem.parameters.items()})
+        one, p = (
+            probe_points(bvp, 2)[0],
+            Named(**{k: torch.full((2, 1), v) for k, v in problem.parameters.items()}),
+        )
         psi = problem.terminal_manifold(one, problem.named(bvp.unit.expand(2, -1)), p)
         out["n_multipliers"] = psi.shape[-1]
     return out

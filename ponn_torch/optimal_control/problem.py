@@ -159,11 +159,7 @@ class OptimalControlProblem:
     @property
     def component_names(self) -> list[str]:
         """One name per scalar state: r_1, r_2, r_3, …, m."""
-        return [
-            name if size == 1 else f"{name}_{i + 1}"
-            for name, size in self.states.items()
-            for i in range(size)
-        ]
+        return [name if size == 1 else f"{name}_{i + 1}" for name, size in self.states.items() for i in range(size)]
 
     def named(self, x: Tensor) -> Named:
         """View a state vector (..., n_states) by the names of its blocks."""
@@ -229,7 +225,9 @@ class OptimalControlProblem:
             ("terminal_cost", self.terminal_cost, (one, self.named(x), p)),
         ):
             if function is not None and tuple(function(*args).shape) != (5, 1):
-                raise ValueError(f"{self.name}: {label} returns shape {tuple(function(*args).shape)}; (..., 1) is needed")
+                raise ValueError(
+                    f"{self.name}: {label} returns shape {tuple(function(*args).shape)}; (..., 1) is needed"
+                )
 
 
 # -- problems by reference -------------------------------------------------------------------------------------------

@@ -9,7 +9,8 @@ import torch
 from ponn_torch.optimal_control.control_laws import Box, ThrustBall, Unconstrained
 from ponn_torch.optimal_control.problem import FreeTime, Named, OptimalControlProblem
 
-_ENDS = {"initial": {"x": 0.0, "v": 0.0}, "final": {"x": 1.0, "v": 0.0}}
+INITIAL = {"x": 0.0, "v": 0.0}
+FINAL = {"x": 1.0, "v": 0.0}
 
 
 def _dynamics(t: torch.Tensor, x: Named, u: Named, p: Named) -> dict[str, torch.Tensor]:
@@ -26,7 +27,8 @@ def minimum_energy() -> OptimalControlProblem:
         running_cost=lambda t, x, u, p: 0.5 * u.force * u.force,
         final_time=1.0,
         known_cost=6.0,
-        **_ENDS,
+        initial=INITIAL,
+        final=FINAL,
     )
 
 
@@ -40,7 +42,8 @@ def minimum_time() -> OptimalControlProblem:
         running_cost=lambda t, x, u, p: torch.ones_like(u.force),
         final_time=FreeTime(3.0),
         known_cost=2.0,
-        **_ENDS,
+        initial=INITIAL,
+        final=FINAL,
     )
 
 
@@ -60,5 +63,6 @@ def minimum_fuel(*, final_time: float = 3.0) -> OptimalControlProblem:
         running_cost=lambda t, x, u, p: u.force_magnitude,
         final_time=final_time,
         known_cost=final_time - math.sqrt(final_time**2 - 4.0),
-        **_ENDS,
+        initial=INITIAL,
+        final=FINAL,
     )

@@ -90,7 +90,13 @@ def energy_transfer_limited(
         initial={**initial, "m": initial_mass},
         final=final,
         final_time=final_time_days * DAY,
-        units={"r": ASTRONOMICAL_UNIT, "v": SPEED_UNIT, "m": initial_mass, "time": TIME_UNIT, "cost": TIME_UNIT},
+        units={
+            "r": ASTRONOMICAL_UNIT,
+            "v": SPEED_UNIT,
+            "m": initial_mass,
+            "time": TIME_UNIT,
+            "cost": TIME_UNIT,
+        },
         # dH/dδ = 2δ − |λv| Tmax/m − …: at δ of order one |λv| Tmax/m is, so costates are cost per (Tmax/m) of speed
         costate_units={
             "r": initial_mass / maximum_thrust / TIME_UNIT,

@@ -88,9 +88,7 @@ class TensorBoard(Recorder):
         self._stage = index
         self._writer.add_text("stage/started", f"{name}, ρ = {smoothing}" if smoothing else name, self._step)
 
-    def iteration(
-        self, record: Record, blocks: Callable[[], Mapping[str, float]], cost: Callable[[], float]
-    ) -> None:
+    def iteration(self, record: Record, blocks: Callable[[], Mapping[str, float]], cost: Callable[[], float]) -> None:
         self._step = int(record.get("global_step", self._step + 1))
         values = {"residual/total": float(record["norm"])}
         values |= {f"residual/{name}": float(norm) for name, norm in blocks().items()}
@@ -136,9 +134,7 @@ class TensorBoard(Recorder):
             figure = stage_figure(solution)
             figure.savefig(image, format="png", dpi=80)
             width, height = figure.canvas.get_width_height()
-            picture = Summary.Image(
-                height=height, width=width, colorspace=4, encoded_image_string=image.getvalue()
-            )
+            picture = Summary.Image(height=height, width=width, colorspace=4, encoded_image_string=image.getvalue())
             self._add(Summary(value=[Summary.Value(tag="stage/control", image=picture)]), step)
         if not self._failed:  # what torch prepares says success; a session without an end reads as unknown
             self._add(self._end, self._step)

@@ -40,9 +40,7 @@ from ponn_torch.solving.observer import StageResult
 from ponn_torch.solving.solution import Samples, Solution
 
 
-def _block(
-    ax: Axes, t: Tensor, values: Tensor, shown: DisplayUnit, labels: Sequence[str], label: str
-) -> None:
+def _block(ax: Axes, t: Tensor, values: Tensor, shown: DisplayUnit, labels: Sequence[str], label: str) -> None:
     """The components (m, size) of one named quantity on one axis; a legend only where there are several."""
     for i, name in enumerate(labels):
         ax.plot(t, values[:, i].cpu() / shown.size, color=COMPONENTS[i % len(COMPONENTS)], label=name)

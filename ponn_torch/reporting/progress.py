@@ -61,9 +61,7 @@ class Progress(Recorder):
     def stage_started(self, name: str, smoothing: float | None, index: int) -> None:
         self._live(f"{name:7} {_smoothing(smoothing)}")
 
-    def iteration(
-        self, record: Record, blocks: Callable[[], Mapping[str, float]], cost: Callable[[], float]
-    ) -> None:
+    def iteration(self, record: Record, blocks: Callable[[], Mapping[str, float]], cost: Callable[[], float]) -> None:
         if self._bar is None:
             return
         value = cost()

@@ -50,9 +50,7 @@ class JsonLines(Recorder):
     def stage_started(self, name: str, smoothing: float | None, index: int) -> None:
         self._write("stage_started", name=name, smoothing=smoothing, index=index)
 
-    def iteration(
-        self, record: Record, blocks: Callable[[], Mapping[str, float]], cost: Callable[[], float]
-    ) -> None:
+    def iteration(self, record: Record, blocks: Callable[[], Mapping[str, float]], cost: Callable[[], float]) -> None:
         value = cost()
         known = {"cost": value} if math.isfinite(value) else {}
         self._write("iteration", **record, residual=dict(blocks()), **known)
@@ -100,9 +98,7 @@ class RunRecorder(Recorder):
         extra: tuple[Recorder, ...] = (),
     ) -> None:
         if cost_every < 0:
-            raise ValueError(
-                f"cost_every = {cost_every}; allowed: 0 (at stage ends only) or a number of iterations"
-            )
+            raise ValueError(f"cost_every = {cost_every}; allowed: 0 (at stage ends only) or a number of iterations")
         self.folder, self.step, self._cost_every = Path(folder), 0, cost_every
         self.folder.mkdir(parents=True, exist_ok=True)
         self.recorders: list[Recorder] = [JsonLines(self.folder / RECORDS)]
@@ -124,9 +120,7 @@ class RunRecorder(Recorder):
         for recorder in self.recorders:
             recorder.stage_started(name, smoothing, index)
 
-    def iteration(
-        self, record: Record, blocks: Callable[[], Mapping[str, float]], cost: Callable[[], float]
-    ) -> None:
+    def iteration(self, record: Record, blocks: Callable[[], Mapping[str, float]], cost: Callable[[], float]) -> None:
         self.step += 1
         due = self._cost_every > 0 and self.step % self._cost_every == 0
         numbered = {"global_step": self.step, **self._stage, **record}

@@ -95,9 +95,7 @@ def _frames(error: BaseException) -> list[str]:
     out = []
     for frame in traceback.extract_tb(error.__traceback__):
         parts = Path(frame.filename).parts
-        root = next(
-            (i for i in reversed(range(len(parts))) if parts[i] in ("ponn_torch", "site-packages")), None
-        )
+        root = next((i for i in reversed(range(len(parts))) if parts[i] in ("ponn_torch", "site-packages")), None)
         shown = "/".join(parts[root:] if root is not None else parts[-1:])
         out.append(f"{shown}:{frame.lineno} in {frame.name}")
     return out

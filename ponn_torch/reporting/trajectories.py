@@ -30,6 +30,7 @@ from ponn_torch.solving.solution import Samples, Solution
 
 POSITION = "r"  # the state that these figures draw
 N_ARROWS = 28
+N_POSTS = 9  # in the figure in space
 
 
 @dataclass(frozen=True)
@@ -41,6 +42,7 @@ class _Path:
     feet: Tensor
     arrows: Tensor
     labels: list[str]
+    name_of_arrows: str
 
     @property
     def shows_origin(self) -> bool:
@@ -56,10 +58,10 @@ class _Path:
         return self.position.amax(0) - self.position.amin(0)
 
 
-def _thrust(samples: Samples) -> Tensor | None:
-    """The first control that is a vector like the position."""
+def _thrust(samples: Samples) -> tuple[str, Tensor] | None:
+    """Name and values of the first control that is a vector like the position."""
     size = samples.states[POSITION].shape[-1]
-    return next((u for u in samples.control.values() if u.shape[-1] == size), None)
+    return next(((name, u) for name, u in samples.control.items() if u.shape[-1] == size), None)
 
 
 def _path(solution: Solution) -> _Path:
@@ -74,11 +76,12 @@ def _path(solution: Solution) -> _Path:
         pieces.append((position[here], ARCS.get(arc, BLUE)))
     pieces = pieces or [(position, BLUE)]
     feet = arrows = position[:0]
-    thrust = _thrust(samples)
+    thrust, name_of_control = _thrust(samples), ""
     if thrust is not None:
+        name_of_control = thrust[0]
         at = torch.linspace(0.0, solution.final_time, N_ARROWS + 2, dtype=samples.t.dtype)[1:-1]
         some = solution(at.to(samples.t.device))
-        vector = next(u for name, u in some.control.items() if samples.control[name] is thrust).cpu()
+        vector = some.control[name_of_control].cpu()
         size = vector.norm(dim=-1, keepdim=True)
         on = size[:, 0] > 0.02 * size.max()
         feet = some.states[POSITION].cpu()[on] / size_of_unit
@@ -87,7 +90,7 @@ def _path(solution: Solution) -> _Path:
     label_of_unit = f"$10^{{{exponent}}}$ {shown.label}".rstrip() if exponent else shown.label
     symbols = component_symbols(POSITION, position.shape[-1])
     labels = [f"{label} ({label_of_unit})" if label_of_unit else label for label in symbols]
-    return _Path(position, pieces, feet, arrows, labels)
+    return _Path(position, pieces, feet, arrows, labels, name_of_control.replace("_", " "))
 
 
 def _key(solution: Solution, path: _Path) -> list[Line2D]:
@@ -101,7 +104,7 @@ def _key(solution: Solution, path: _Path) -> list[Line2D]:
         marks.append(Line2D([], [], color=ORANGE, mec=BLACK, mew=0.4, marker="*", ms=11, ls="", label=name))
     present = [arc for arc in ARCS if arc in solution.arcs]
     arcs = [Line2D([], [], color=ARCS[arc], lw=2, label=f"{arc} arc") for arc in present]
-    arrow = [Line2D([], [], color=BLACK, marker=r"$\rightarrow$", ms=11, ls="", alpha=0.7, label="control")]
+    arrow = [Line2D([], [], color=BLACK, marker=r"$\rightarrow$", ms=11, ls="", alpha=0.7)]
     return [*marks, *arcs, *(arrow if len(path.feet) else [])]
 
 
@@ -152,6 +155,16 @@ def plane_figure(solution: Solution) -> Figure | None:
     return figure
 
 
+def _draw_shadow(path: _Path, ax: Any, floor: float) -> None:
+    """The path's shadow on the floor, and posts of equal spacing along it that tell the height."""
+    x, y, z = path.position.T
+    ax.plot(x, y, torch.full_like(z, floor), color=GREY, lw=1.2, ls=(0, (4, 2)))
+    steps = torch.cat([z.new_zeros(1), path.position.diff(dim=0).norm(dim=-1).cumsum(0)])
+    at = torch.searchsorted(steps, torch.linspace(0.0, float(steps[-1]), N_POSTS, dtype=z.dtype))
+    for i in at.clamp_max(len(z) - 1).tolist():
+        ax.plot([x[i], x[i]], [y[i], y[i]], [floor, z[i]], color=GREY, lw=0.6, alpha=0.7)
+
+
 @house_style
 def trajectory_figure(solution: Solution) -> Figure | None:
     """The path in space, equal axes, with thrust arrows; None where position is not a 3-vector ``r``."""
@@ -161,8 +174,9 @@ def trajectory_figure(solution: Solution) -> Figure | None:
     low, high = path.position.amin(0), path.position.amax(0)
     if path.shows_origin:
         low, high = low.clamp_max(0.0), high.clamp_min(0.0)
-    # equal axes; a nearly flat path still gets a box that can be read
-    half = torch.maximum((high - low) / 2, 0.15 * (high - low).max()) * 1.08
+    # equal axes; a nearly flat path still gets a box that can be read, and a tall one a floor to stand on
+    extent = (high - low).max() * torch.tensor([0.3, 0.3, 0.15], dtype=low.dtype)
+    half = torch.maximum((high - low) / 2, extent) * 1.08
     middle, shape = (high + low) / 2, half / half.max()
     figure = Figure(figsize=(6.4, 4.2 + 1.4 * float(shape[2])))
     # placed by hand: the layout engines do not see the labels of 3-D axes
@@ -178,9 +192,7 @@ def trajectory_figure(solution: Solution) -> Figure | None:
     for axis, m, h in zip("xyz", middle.tolist(), half.tolist(), strict=True):
         getattr(ax, f"set_{axis}lim")(m - h, m + h)
     ax.set_box_aspect(shape.tolist(), zoom=1.3 - 0.35 * float(shape[2]))
-    # the shadow on the floor tells the height
-    floor = torch.full_like(path.position[:, 0], float(middle[2] - half[2]))
-    ax.plot(path.position[:, 0], path.position[:, 1], floor, color=GREY, lw=0.8, alpha=0.6)
+    _draw_shadow(path, ax, float(middle[2] - half[2]))
     for axis, label, share in zip((ax.xaxis, ax.yaxis, ax.zaxis), path.labels, shape, strict=True):
         axis.set_label_text(label)
         axis.labelpad = 7

@@ -111,18 +111,12 @@ class Certificate:
         lines.append(f"{'check (scaled)':<40}{'measured':>12}{'allowed':>12}")
         for name, value, allowed in checks:
             if value is not None:
-                lines.append(
-                    f"{name:<40}{value:>12.2e}{allowed:>12.1e}{'' if value <= allowed else '  FAILS'}"
-                )
+                lines.append(f"{name:<40}{value:>12.2e}{allowed:>12.1e}{'' if value <= allowed else '  FAILS'}")
         lines.append("")
         for name, value in self.end_errors.items():
             alone = self.control_end_errors[name]
             lines.append(f"end error of {name} (user units): {value:.3e} flown, {alone:.3e} control alone")
-        known = (
-            ""
-            if self.cost_error is None
-            else f", known optimum {self.known_cost:.10g} ({self.cost_error:+.3e})"
-        )
+        known = "" if self.cost_error is None else f", known optimum {self.known_cost:.10g} ({self.cost_error:+.3e})"
         lines.append(f"{self.cost_name}: {self.cost:.10g}, flown {self.flown_cost:.10g}{known}")
         lines.append(f"CPU time: {self.seconds:.2f} s")
         return "\n".join(lines)

@@ -27,9 +27,7 @@ def _last(solution: Solution, flight: Flight) -> tuple[Tensor, Tensor, Setting]:
 
 def _segments(solution: Solution, flight: Flight) -> Tensor:
     """A segment of its arc for every step."""
-    first = torch.tensor(
-        [segments.start for segments in solution.arc_segments], device=solution.curve.xi.device
-    )
+    first = torch.tensor([segments.start for segments in solution.arc_segments], device=solution.curve.xi.device)
     return first[torch.from_numpy(flight.arc).to(first.device)]
 
 
@@ -171,9 +169,7 @@ def signs(solution: Solution, tolerance: float, n_points: int = 401) -> tuple[fl
     for segments, (start, end) in zip(solution.arc_segments, pairwise(arc_knots(solution)), strict=True):
         codes = arcs[segments.start]
 
-        def switching(
-            z: Tensor, segments: range = segments, start: float = start, end: float = end
-        ) -> Tensor:
+        def switching(z: Tensor, segments: range = segments, start: float = start, end: float = end) -> Tensor:
             t = start + (end - start) * (z + 1.0) / 2
             w, setting = solution.at(t, curve.segment_of(t).clamp(segments.start, segments.stop - 1))
             return solution.bvp.switching(t[:, None], w, setting)

@@ -1,7 +1,7 @@
 """Continuation: in which order the values of a parameter are tried, and when to stop.
 
-A schedule decides values only. The conductor solves: it calls ``attempt(value, parameter, form)``, keeps the warm start,
-and answers with an Outcome; a failed attempt leaves the last good point as the next start.
+A schedule decides values only. The conductor solves: it calls ``attempt(value, parameter, form)``, keeps the warm
+start, and answers with an Outcome; a failed attempt leaves the last good point as the next start.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from enum import Enum
 from typing import Protocol
 
-from ponn_torch.optimal_control.collocation import Form
+from ponn_torch.optimal_control.discretisation import Form
 
 
 class Outcome(Enum):
@@ -55,7 +55,11 @@ class Ladder:
 
 
 def log_ladder(
-    first: float = 1.0, last: float = 1e-10, count: int = 20, form: Form | None = None, stop_unchanged: bool = False
+    first: float = 1.0,
+    last: float = 1e-10,
+    count: int = 20,
+    form: Form | None = None,
+    stop_unchanged: bool = False,
 ) -> Ladder:
     """Logarithmically spaced smoothing; the defaults are the PoNN paper's twenty values from 1 to 1e-10."""
     _check_values("smoothing", (first, last))

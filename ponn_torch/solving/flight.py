@@ -135,9 +135,7 @@ def control_history(solution: Solution) -> list[PiecewiseChebyshev]:
 def _point_setting(solution: Solution, smoothing: Tensor | None, arcs: Tensor | None) -> Setting:
     given = solution.curve.collocation.setting
     return Setting(
-        Regime(
-            None if given.regime.smoothing is None else smoothing, arcs if solution.kind == "split" else None
-        ),
+        Regime(None if given.regime.smoothing is None else smoothing, arcs if solution.kind == "split" else None),
         {name: value.double().cpu().reshape(1) for name, value in given.parameters.items()},
     )
 
@@ -145,9 +143,7 @@ def _point_setting(solution: Solution, smoothing: Tensor | None, arcs: Tensor | 
 def fly_extremal(solution: Solution, history: list[PiecewiseChebyshev], *, explicit_time: bool) -> Flight:
     """States and costates from the found start under the regime's law; y = (w, ∫L dt, ∫∂H/∂t dt)."""
     bvp, given = solution.reference, solution.curve.collocation.setting.regime
-    smoothing = (
-        torch.zeros(1, dtype=torch.float64) if given.smoothing is None else given.smoothing.double().cpu()
-    )
+    smoothing = torch.zeros(1, dtype=torch.float64) if given.smoothing is None else given.smoothing.double().cpu()
     codes = torch.zeros(1, 1, dtype=torch.long)
     if given.arcs is not None:
         codes = given.arcs[[segments.start for segments in solution.arc_segments]].cpu()
@@ -177,18 +173,14 @@ def fly_control(solution: Solution, history: list[PiecewiseChebyshev]) -> Flight
     bvp, problem = solution.reference, solution.problem
     x0, _ = bvp.to_physical(solution.curve.knots[0].detach().double().cpu())
     known = problem.boundary("initial")
-    x0 = torch.tensor(
-        [x if k is None else k for x, k in zip(x0.tolist(), known, strict=True)], dtype=torch.float64
-    )
+    x0 = torch.tensor([x if k is None else k for x, k in zip(x0.tolist(), known, strict=True)], dtype=torch.float64)
     sizes = list(bvp.law.names.values())
     p = Named(**_point_setting(solution, None, None).parameters)
 
     def right_hand_side(t: Tensor, y: Tensor, controls: Tensor) -> Tensor:
         state, time = problem.named(bvp.unit * y[: bvp.n_states]), t * bvp.time_unit
         u = Named(**dict(zip(bvp.law.names, controls.split(sizes, -1), strict=True)))
-        rates = problem.stack(problem.dynamics(time, state, u, p), y[: bvp.n_states]) * (
-            bvp.time_unit / bvp.unit
-        )
+        rates = problem.stack(problem.dynamics(time, state, u, p), y[: bvp.n_states]) * (bvp.time_unit / bvp.unit)
         if problem.running_cost is None:
             return torch.cat([rates, torch.zeros_like(t)])
         return torch.cat([rates, problem.running_cost(time, state, u, p) * (bvp.time_unit / bvp.cost_unit)])

@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Protocol
 
 import torch
 from torch import Tensor
 
 from ponn_torch.ansatz.basis import Chebyshev
-from ponn_torch.optimal_control.collocation import Collocation, Discretisation, Strong, Unknowns
+from ponn_torch.optimal_control.collocation import Collocation, Unknowns
 from ponn_torch.optimal_control.curve import Curve
+from ponn_torch.optimal_control.discretisation import Discretisation, Strong
 from ponn_torch.optimal_control.pontryagin import BoundaryValueProblem
 
 ScaledCurve = Callable[[Tensor], Tensor]  # scaled times (m,) → w (m, 2n)
@@ -41,9 +41,13 @@ def project(collocation: Collocation, curve: ScaledCurve, times: Tensor | None =
     for group in disc.groups:
         if group.trivial:
             continue
-        kappa, _ = collocation._kappa(group, unknowns, h)
+        kappa, _ = collocation.kappa(group, unknowns, h)
         fitted = group.expression.fit(
-            disc.nodes.points, values[..., group.columns[:, 0]], kappa.mT, weights=disc.nodes.weights, ridge=1e-18
+            disc.nodes.points,
+            values[..., group.columns[:, 0]],
+            kappa.mT,
+            weights=disc.nodes.weights,
+            ridge=1e-18,
         )
         unknowns.weights[:, group.own] = fitted.mT.flatten(-2)
     return collocation.pack(unknowns)
@@ -55,7 +59,7 @@ class Guess(Protocol):
     def curve(self, bvp: BoundaryValueProblem, seed: int) -> ScaledCurve: ...
 
 
-# -- random functions ---------------------------------------------------------------------------------------------------------
+# -- random functions ------------------------------------------------------------------------------------------------
 
 DISTRIBUTIONS: dict[str, Callable[[Tensor, torch.Generator], Tensor]] = {
     "uniform": lambda like, g: torch.rand(like.shape, generator=g, dtype=torch.float64).to(like),
@@ -102,6 +106,9 @@ class RandomGuess:
                 view[held] = 0.0
         known = collocation.known_knots
         unknowns = Unknowns(
-            weights, torch.where(torch.isnan(known), knots, known), collocation.known_times, like.new_zeros(bvp.n_multipliers)
+            weights,
+            torch.where(torch.isnan(known), knots, known),
+            collocation.known_times,
+            like.new_zeros(bvp.n_multipliers),
         )
         return Curve(collocation, collocation.pack(unknowns))

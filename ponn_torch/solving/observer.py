@@ -48,9 +48,7 @@ class Observer:
     def stage_started(self, name: str, smoothing: float | None, index: int) -> None:
         """Stage ``index`` (counted over all starts from 0) begins."""
 
-    def iteration(
-        self, record: Record, blocks: Callable[[], Mapping[str, float]], cost: Callable[[], float]
-    ) -> None:
+    def iteration(self, record: Record, blocks: Callable[[], Mapping[str, float]], cost: Callable[[], float]) -> None:
         """An iteration ended; ``blocks`` (norm per equation) and ``cost`` (user units) run when called."""
 
     def stage_ended(self, stage: StageResult) -> None:

@@ -1,7 +1,7 @@
 """First guesses from a path: a straight line, the powered-descent guess of the TFC paper, polar interpolation.
 
-A path gives positions; velocities and accelerations follow by differentiation, costates from what the thrust would have to
-do. The problem must name a position and a velocity of the same size.
+A path gives positions; velocities and accelerations follow by differentiation, costates from what the thrust would
+have to do. The problem must name a position and a velocity of the same size.
 """
 
 from __future__ import annotations
@@ -33,7 +33,9 @@ def _ends(bvp: BoundaryValueProblem, position: str, velocity: str) -> _Ends:
     problem = bvp.problem
     for name in (position, velocity):
         if name not in problem.states:
-            raise ValueError(f"guess needs a state {name!r} in problem {problem.name!r}; {nearest(name, problem.states)}")
+            raise ValueError(
+                f"guess needs a state {name!r} in problem {problem.name!r}; {nearest(name, problem.states)}"
+            )
     first, last = problem.boundary("initial"), problem.boundary("final")
     filled = [
         [a if a is not None else b if b is not None else 0.0 for a, b in zip(one, other, strict=True)]
@@ -82,7 +84,7 @@ def _curve_from_path(
 
 @dataclass(frozen=True)
 class StraightLine:
-    """The straight line between the ends at constant speed, λv a constant unit vector against the change of velocity."""
+    """The straight line between the ends at constant speed, λv a unit vector against the change of velocity."""
 
     position: str = "r"
     velocity: str = "v"
@@ -124,8 +126,8 @@ class PoweredDescent:
 class PolarTransfer:
     """Polar interpolation of a transfer about the z axis, ``revolutions`` extra turns, λv against the thrust it needs.
 
-    The angle follows a cubic that meets the angular rates at both ends, the radius and height likewise; λv is scaled to a
-    mean of one.
+    The angle follows a cubic that meets the angular rates at both ends, the radius and height likewise; λv is scaled
+    to a mean of one.
     """
 
     revolutions: int = 0
@@ -140,7 +142,11 @@ class PolarTransfer:
         ends = _ends(bvp, self.position, self.velocity)
         polar = [_polar(r, v) for r, v in zip(ends.position, ends.velocity, strict=True)]
         (values0, rates0), (values1, rates1) = polar
-        turn = (values1[1] - values0[1]) % (2 * math.pi) if rates0[1] >= 0 else -((values0[1] - values1[1]) % (2 * math.pi))
+        turn = (
+            (values1[1] - values0[1]) % (2 * math.pi)
+            if rates0[1] >= 0
+            else -((values0[1] - values1[1]) % (2 * math.pi))
+        )
         values1 = values1.clone()
         values1[1] = values0[1] + turn + 2 * math.pi * self.revolutions * (1 if rates0[1] >= 0 else -1)
         time = bvp.problem.time_guess

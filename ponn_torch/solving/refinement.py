@@ -2,9 +2,10 @@
 
 ``Split`` cuts the domain at the switches and solves for everything in one least squares: coefficients, knot values,
 switch times and a free final time, with rows S(t_k) = 0 and the control at its bound inside every arc (no smoothing is
-left). Both papers name this as future work. The sign of S is then checked on a fine grid, and where the minimum principle
-asks for other arcs these are tried: a solved residual with the wrong arcs is an extremal of nothing. ``Subdivide`` keeps
-the regime of the curve it is given, so that a smoothed problem is solved to the end as a problem of its own.
+left). Both papers name this as future work. The sign of S is then checked on a fine grid, and where the minimum
+principle asks for other arcs these are tried: a solved residual with the wrong arcs is an extremal of nothing.
+``Subdivide`` keeps the regime of the curve it is given, so that a smoothed problem is solved to the end as one of its
+own.
 """
 
 from __future__ import annotations
@@ -21,9 +22,10 @@ from ponn_torch.ansatz.basis import Legendre, LinearBasis
 from ponn_torch.numerics.nodes import make_nodes
 from ponn_torch.optim.base import Callback, OptimizeResult, Status, Stopping
 from ponn_torch.optim.least_squares import LevenbergMarquardt
-from ponn_torch.optimal_control.collocation import Collocation, Discretisation
+from ponn_torch.optimal_control.collocation import Collocation
 from ponn_torch.optimal_control.control_laws import Regime
 from ponn_torch.optimal_control.curve import Curve
+from ponn_torch.optimal_control.discretisation import Discretisation
 from ponn_torch.optimal_control.pontryagin import BoundaryValueProblem, Setting
 from ponn_torch.solving.guess import project
 from ponn_torch.solving.switching import Structure, find_structure, without_short_arcs
@@ -91,7 +93,9 @@ class Segmentation:
         nodes = make_nodes("legendre_gauss", self.n_nodes, dtype=bvp.unit.dtype, device=bvp.unit.device)
         return Discretisation(bvp, self.basis(self.n_neurons), nodes, conditioning="orthonormal")
 
-    def solve(self, collocation: Collocation, start: Curve, callback: MakeCallback | None) -> tuple[Curve, OptimizeResult]:
+    def solve(
+        self, collocation: Collocation, start: Curve, callback: MakeCallback | None
+    ) -> tuple[Curve, OptimizeResult]:
         """One round, from the projection of ``start``."""
         optimizer = LevenbergMarquardt(self.stopping, damping=self.damping, linear_solver=self.linear_solver)
         on_iteration = callback(collocation) if callback else None
@@ -110,7 +114,8 @@ class Subdivide(Segmentation):
     """
 
     def run(self, start: Curve, callback: MakeCallback | None = None) -> Refined:
-        bvp, setting, rounds = start.collocation.bvp, start.collocation.setting, []
+        bvp, setting = start.collocation.bvp, start.collocation.setting
+        rounds: list[OptimizeResult] = []
         disc = self.discretisation(bvp)
         ends = start.times[[0, -1]]
         times = torch.linspace(0, 1, self.n_segments + 1, dtype=ends.dtype, device=ends.device) * ends[1]
@@ -138,9 +143,9 @@ class Subdivide(Segmentation):
 class Split(Segmentation):
     """Solve between switches until arcs and S agree and the equations hold between the nodes.
 
-    Every arc is one or more segments; those that subdivide it sit at fixed fractions between its switches. Arcs are added
-    where S asks for them and merged away where a failed round made them collapse. When this does not end, the smoothed curve
-    was too blunt to show the structure: it is sharpened, and the split starts anew on more segments.
+    Every arc is one or more segments; those that subdivide it sit at fixed fractions between its switches. Arcs are
+    added where S asks for them and merged away where a failed round made them collapse. When this does not end, the
+    smoothed curve was too blunt to show the structure: it is sharpened, and the split starts anew on more segments.
 
     Attributes:
         max_arcs: more arcs than this are taken for a sign of a singular arc.
@@ -154,13 +159,16 @@ class Split(Segmentation):
     sharpening: float = 0.3
 
     def run(self, start: Curve, callback: MakeCallback | None = None) -> Refined:
-        disc, smoothed, rounds = self.discretisation(start.collocation.bvp), start, []
+        disc, smoothed = self.discretisation(start.collocation.bvp), start
+        rounds: list[OptimizeResult] = []
         refined = self._split(disc, smoothed, self.n_segments, rounds, callback)
         for attempt in range(2, self.max_sharpenings + 2):
             if refined.outcome in (Outcome.SOLVED, Outcome.INTERRUPTED):
                 break
-            if smoothed.collocation.setting.regime.smoothing is not None:
-                smoothed, result = self._sharpened(disc, smoothed, attempt * self.n_segments, callback)
+            smoothing = smoothed.collocation.setting.regime.smoothing
+            if smoothing is not None:
+                sharper = self.sharpening * smoothing
+                smoothed, result = self._sharpened(disc, smoothed, sharper, attempt * self.n_segments, callback)
                 rounds.append(result)
                 if result.status is Status.INTERRUPTED:
                     return Refined(smoothed, Outcome.INTERRUPTED, rounds)
@@ -217,13 +225,12 @@ class Split(Segmentation):
         return Refined(curve, outcome, rounds)
 
     def _sharpened(
-        self, disc: Discretisation, curve: Curve, n_segments: int, callback: MakeCallback | None
+        self, disc: Discretisation, curve: Curve, smoothing: Tensor, n_segments: int, callback: MakeCallback | None
     ) -> tuple[Curve, OptimizeResult]:
         """The smoothed problem at a lower smoothing."""
-        smoothing = curve.collocation.setting.regime.smoothing
         share = torch.linspace(0, 1, n_segments + 1, dtype=curve.xi.dtype, device=curve.xi.device)
         collocation = Collocation.on_segments(disc, share * curve.times[-1], setting=curve.collocation.setting)
-        return self.solve(collocation.with_setting(smoothing=self.sharpening * smoothing), curve, callback)
+        return self.solve(collocation.with_setting(smoothing=smoothing), curve, callback)
 
 
 @dataclass(frozen=True)
@@ -238,7 +245,8 @@ class Segments:
         """Cut the chosen segments (K,) in two; all of them if None."""
         k = len(self.arcs)
         chosen = [True] * k if which is None else which.tolist()
-        times, events, codes = [self.times[0]], [], []
+        times, codes = [self.times[0]], []
+        events: list[int | None] = []
         for i in range(k):
             if chosen[i]:
                 times.append(0.5 * (self.times[i] + self.times[i + 1]))
@@ -256,7 +264,8 @@ def _spread(structure: Structure, times: Tensor, n_segments: int) -> Segments:
     ends = torch.cat([times[:1], structure.times, times[-1:]])
     share = (ends[1:] - ends[:-1]) / (ends[-1] - ends[0]) * n_segments
     counts = share.round().clamp_min(1).long().tolist()
-    knots, events, codes = [ends[:1]], [], []
+    knots, codes = [ends[:1]], []
+    events: list[int | None] = []
     for i, count in enumerate(counts):
         steps = torch.arange(1, count + 1, dtype=ends.dtype, device=ends.device) / count
         knots.append(ends[i] + steps * (ends[i + 1] - ends[i]))

@@ -63,9 +63,7 @@ class Solution:
 
     def __post_init__(self) -> None:
         if self.curve.xi.dim() != 1:
-            raise ValueError(
-                f"xi has shape {tuple(self.curve.xi.shape)}; a Solution holds one curve, shape (N,)"
-            )
+            raise ValueError(f"xi has shape {tuple(self.curve.xi.shape)}; a Solution holds one curve, shape (N,)")
         regime = self.curve.collocation.setting.regime
         if self._jumps and regime.arcs is None and regime.smoothing is None:
             raise ValueError(
@@ -211,9 +209,7 @@ class Solution:
         slack = 1e-12 * self.final_time
         outside = (seconds < -slack) | (seconds > self.final_time + slack) | torch.isnan(seconds)
         if bool(outside.any()):
-            raise ValueError(
-                f"t = {seconds[outside][0]:g} s; allowed: from 0 to final_time = {self.final_time:g} s"
-            )
+            raise ValueError(f"t = {seconds[outside][0]:g} s; allowed: from 0 to final_time = {self.final_time:g} s")
         scaled = (seconds / self.bvp.time_unit).clamp(self.curve.times[0], self.curve.times[-1])
         return self._samples(scaled, self.curve.segment_of(scaled))
 
@@ -263,9 +259,7 @@ class Solution:
         cost = problem.display.get("cost", DisplayUnit(""))
 
         def add(name: str, values: Tensor, label: str, size: float) -> None:
-            numbered = (
-                [name] if values.shape[-1] == 1 else [f"{name}_{i + 1}" for i in range(values.shape[-1])]
-            )
+            numbered = [name] if values.shape[-1] == 1 else [f"{name}_{i + 1}" for i in range(values.shape[-1])]
             for i, entry in enumerate(numbered):
                 columns.append((f"{entry} [{label}]" if label else entry, values[:, i] / size))
 
@@ -278,9 +272,7 @@ class Solution:
             label = "" if unit.label in ("", cost.label) else f"{cost.label or '1'}/({unit.label})"
             add(f"lambda_{name}", values, label, cost.size / unit.size)
         for name, values in samples.control.items():
-            unit = problem.display.get(
-                name, problem.display.get(name.removesuffix("_magnitude"), DisplayUnit(""))
-            )
+            unit = problem.display.get(name, problem.display.get(name.removesuffix("_magnitude"), DisplayUnit("")))
             add(name, values, unit.label, unit.size)
         add("S", samples.switching, "", 1.0)
         add("H", samples.hamiltonian[:, None], f"{cost.label or '1'}/{time.label}", cost.size / time.size)

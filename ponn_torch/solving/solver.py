@@ -1,12 +1,12 @@
 """The conductor: from a problem to a certified solution in one call.
 
-start → continuation in the smoothing on a single domain (or fixed segments) → split at the switches → certificate. A start
-that fails is recognised early and the next one is tried; whatever was computed is kept and reported.
+start → continuation in the smoothing on a single domain (or fixed segments) → split at the switches → certificate. A
+start that fails is recognised early and the next one is tried; whatever was computed is kept and reported.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
 import torch
@@ -14,16 +14,26 @@ from torch import Tensor
 
 from ponn_torch.ansatz.basis import Chebyshev, LinearBasis
 from ponn_torch.numerics.nodes import make_nodes
-from ponn_torch.optim.base import Callback, NonFiniteResidual, OptimizeResult, Optimizer, Record, Status, Stopping, Stopwatch
+from ponn_torch.optim.base import (
+    Callback,
+    NonFiniteResidual,
+    Optimizer,
+    OptimizeResult,
+    Record,
+    Status,
+    Stopping,
+    Stopwatch,
+)
 from ponn_torch.optim.least_squares import LevenbergMarquardt
-from ponn_torch.optimal_control.collocation import Collocation, Discretisation, Form, Strong
+from ponn_torch.optimal_control.collocation import Collocation
 from ponn_torch.optimal_control.curve import Curve
+from ponn_torch.optimal_control.discretisation import Discretisation, Form, Strong
 from ponn_torch.optimal_control.pontryagin import BoundaryValueProblem, pontryagin
 from ponn_torch.optimal_control.problem import OptimalControlProblem
+from ponn_torch.solving import refinement as refinements
 from ponn_torch.solving.certificate import Certificate, Tolerances, certify
 from ponn_torch.solving.continuation import Ladder, Outcome, Schedule
 from ponn_torch.solving.guess import Guess, RandomGuess, project
-from ponn_torch.solving import refinement as refinements
 from ponn_torch.solving.observer import Observer, SilentObserver, StageResult
 from ponn_torch.solving.refinement import Refinement, Split, Subdivide
 from ponn_torch.solving.solution import Solution
@@ -93,7 +103,7 @@ class Solver:
                 raise ValueError(f"{name} = {value}; allowed: at least 1")
 
     def solve(self, problem: OptimalControlProblem, seed: int = 0, observer: Observer | None = None) -> SolveResult:
-        """Solve from random starts of ``seed``; never raises for want of convergence, the message says what happened."""
+        """Solve from random starts of ``seed``; the result's message says what happened, it does not raise."""
         return _Run(self, problem, seed, observer or SilentObserver()).result()
 
     def discretisation(self, bvp: BoundaryValueProblem, form: Form | None = None) -> Discretisation:
@@ -124,7 +134,8 @@ class _Run:
         message, interrupted, n_certified = "", False, 0
         seconds = 0.0  # certificates apart
         try:
-            for self.start in range(self.solver.n_starts):
+            for start in range(self.solver.n_starts):
+                self.start = start
                 watch = Stopwatch()
                 candidate, note = self._one_start()
                 seconds += watch.seconds
@@ -251,7 +262,7 @@ class _Run:
             return solution, ""
         return smoothed, f"{name}: {refined.outcome.value}"
 
-    # -- bookkeeping -----------------------------------------------------------------------------------------------------
+    # -- bookkeeping -------------------------------------------------------------------------------------------------
 
     def _callback(self, collocation: Collocation) -> Callback:
         """Translate an optimiser's iteration for the observer; norms and cost are computed only if asked for."""
@@ -277,7 +288,14 @@ class _Run:
 
     def _record(self, name: str, curve: Curve, result: OptimizeResult) -> Solution:
         solution = Solution(curve)
-        self._stage(name, _smoothing(curve.collocation), result, solution.off_node_residual, float(curve.collocation.cost(curve.xi)), solution)
+        self._stage(
+            name,
+            _smoothing(curve.collocation),
+            result,
+            solution.off_node_residual,
+            float(curve.collocation.cost(curve.xi)),
+            solution,
+        )
         return solution
 
     def _stage(
@@ -318,5 +336,3 @@ def _better(one: Certificate, other: Certificate) -> bool:
 def _smoothing(collocation: Collocation) -> float | None:
     value = collocation.setting.regime.smoothing
     return None if value is None else float(value)
-
-

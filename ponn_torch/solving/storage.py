@@ -15,9 +15,10 @@ from torch import Tensor
 from ponn_torch import __version__
 from ponn_torch.ansatz.basis import LinearBasis
 from ponn_torch.numerics.nodes import NodeSet
-from ponn_torch.optimal_control.collocation import Collocation, Discretisation, Form, Strong, Weak
+from ponn_torch.optimal_control.collocation import Collocation
 from ponn_torch.optimal_control.control_laws import Regime
 from ponn_torch.optimal_control.curve import Curve
+from ponn_torch.optimal_control.discretisation import Discretisation, Form, Strong, Weak
 from ponn_torch.optimal_control.pontryagin import Chain, Setting, pontryagin
 from ponn_torch.optimal_control.problem import OptimalControlProblem, load_problem, nearest
 
@@ -66,9 +67,7 @@ def save_curve(curve: Curve, folder: Path) -> None:
     given = {name: value.detach().cpu().numpy() for name, value in arrays.items() if value is not None}
     with (folder / WEIGHTS).open("wb") as stream:
         np.savez(stream, **given)  # type: ignore[arg-type]
-    (folder / SOLUTION).write_text(
-        json.dumps(description, indent=2, ensure_ascii=False) + "\n", encoding="utf-8"
-    )
+    (folder / SOLUTION).write_text(json.dumps(description, indent=2, ensure_ascii=False) + "\n", encoding="utf-8")
 
 
 def load_curve(folder: Path, problem: OptimalControlProblem | None = None) -> Curve:
@@ -93,9 +92,7 @@ def load_curve(folder: Path, problem: OptimalControlProblem | None = None) -> Cu
             f"{folder / SOLUTION}: problem = {problem.name!r}; allowed: {description['problem']['name']!r}, "
             "which was solved"
         )
-    chains = tuple(
-        Chain(tuple(c["columns"]), tuple(c["factors"]), bool(c["trivial"])) for c in description["chains"]
-    )
+    chains = tuple(Chain(tuple(c["columns"]), tuple(c["factors"]), bool(c["trivial"])) for c in description["chains"])
     xi = arrays["xi"]
     bvp = pontryagin(problem, mass_variable=description["mass_variable"], chains=False, dtype=xi.dtype)
     form = description["form"]
@@ -124,11 +121,7 @@ def load_curve(folder: Path, problem: OptimalControlProblem | None = None) -> Cu
 
 
 def _under(group: str, arrays: dict[str, Tensor]) -> dict[str, Tensor]:
-    return {
-        name.removeprefix(f"{group}/"): value
-        for name, value in arrays.items()
-        if name.startswith(f"{group}/")
-    }
+    return {name.removeprefix(f"{group}/"): value for name, value in arrays.items() if name.startswith(f"{group}/")}
 
 
 def _make_problem(saved: dict[str, Any], folder: Path) -> OptimalControlProblem:
@@ -159,9 +152,7 @@ def _fingerprint(curve: Curve) -> dict[str, Tensor]:
     """What tells one curve of one problem from another: values and rates at some points, boundary data."""
     bvp, n_segments = curve.collocation.bvp, curve.collocation.n_segments
     z = torch.linspace(-0.9, 0.8, 5, dtype=curve.xi.dtype, device=curve.xi.device)
-    t, w, _ = (
-        torch.cat(parts) for parts in zip(*(curve.on_segment(z, k) for k in range(n_segments)), strict=True)
-    )
+    t, w, _ = (torch.cat(parts) for parts in zip(*(curve.on_segment(z, k) for k in range(n_segments)), strict=True))
     segment = torch.arange(n_segments, device=z.device).repeat_interleave(len(z))
     states, costates = bvp.to_physical(w)
     time = curve.times[-1:] if bvp.problem.free_final_time else curve.times.new_tensor([bvp.final_time])

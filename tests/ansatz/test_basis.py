@@ -13,9 +13,7 @@ BASES = {
     "legendre": lambda: Legendre(9),
     "legendre, degrees 2 to 7": lambda: Legendre(6, lowest_degree=2),
     **{activation: lambda a=activation: RandomFeatures(6, a, seed=3) for activation in ACTIVATIONS},
-    "tanh, independent biases": lambda: RandomFeatures(
-        6, "tanh", weight_range=(-1.0, 1.0), bias_range=(-1.0, 1.0)
-    ),
+    "tanh, independent biases": lambda: RandomFeatures(6, "tanh", weight_range=(-1.0, 1.0), bias_range=(-1.0, 1.0)),
     "rbf": lambda: GaussianRBF(5, 1.5),
     "rbf, own shapes": lambda: GaussianRBF([-0.8, 0.1, 0.9], [0.5, 1.0, 2.0]),
 }
@@ -30,9 +28,7 @@ def test_every_derivative_is_the_derivative_of_the_one_below(name):
     differentiated = vmap(jacfwd(lambda z: basis.features(z[None], 4)[:, 0]), out_dims=1)(Z)
     for order in range(1, 6):
         scale = float(stack[order].abs().max())
-        torch.testing.assert_close(
-            stack[order] / scale, differentiated[order - 1] / scale, rtol=0, atol=1e-13
-        )
+        torch.testing.assert_close(stack[order] / scale, differentiated[order - 1] / scale, rtol=0, atol=1e-13)
 
 
 @pytest.mark.parametrize("name", BASES)
@@ -40,9 +36,7 @@ def test_lower_orders_are_the_head_of_higher_ones_and_jets_combine_them(name):
     basis = BASES[name]()
     stack = basis.features(Z, 3)
     torch.testing.assert_close(basis.features(Z, 0), stack[:1])
-    weights = torch.randn(
-        2, 4, basis.size, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0)
-    )
+    weights = torch.randn(2, 4, basis.size, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
     jet = basis.jet(weights, Z, 3)
     assert jet.shape == (2, 4, 4, len(Z), 3)
     torch.testing.assert_close(jet[1, 2], stack @ weights[1, 2])
@@ -67,16 +61,12 @@ def test_polynomials_are_those_of_numpy(basis, series):
 def test_derivatives_of_high_chebyshev_polynomials_at_the_ends(degree, order):
     # T_k^(e)(1) = prod_{j<e} (k^2 - j^2) / (2j + 1), and (-1)^(k+e) times it at -1
     expected = np.prod([(degree**2 - j**2) / (2 * j + 1) for j in range(order)])
-    ends = Chebyshev(degree + 1).features(torch.tensor([-1.0, 1.0], dtype=torch.float64), order)[
-        order, :, degree
-    ]
+    ends = Chebyshev(degree + 1).features(torch.tensor([-1.0, 1.0], dtype=torch.float64), order)[order, :, degree]
     np.testing.assert_allclose(ends, [(-1) ** (degree + order) * expected, expected], rtol=1e-14)
 
 
 def test_the_lowest_degree_shifts_the_columns():
-    torch.testing.assert_close(
-        Legendre(5, lowest_degree=3).features(Z, 2), Legendre(8).features(Z, 2)[..., 3:]
-    )
+    torch.testing.assert_close(Legendre(5, lowest_degree=3).features(Z, 2), Legendre(8).features(Z, 2)[..., 3:])
 
 
 def test_random_features_are_reproduced_by_their_seed_only():

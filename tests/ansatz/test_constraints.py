@@ -103,9 +103,7 @@ def test_switching_functions_need_no_constraints():
 
 
 def test_a_constraint_is_its_functional():
-    basis = Legendre(
-        6
-    )  # on P_k: P_k(1) = 1, P_k(-1) = (-1)^k, P_k'(1) = k (k + 1) / 2, zero mean but for k = 0
+    basis = Legendre(6)  # on P_k: P_k(1) = 1, P_k(-1) = (-1)^k, P_k'(1) = k (k + 1) / 2, zero mean but for k = 0
     k = torch.arange(6, dtype=torch.float64)
     sign = (-1) ** k
     cases = {
@@ -181,9 +179,7 @@ def test_any_regular_set_is_dual_to_its_switching_functions(drawn):
 def test_a_combination_of_regular_constraints_clashes_with_exactly_those_it_combines(drawn, data):
     n_variables, constraints = drawn
     switching_functions_or_discard(constraints, n_variables)
-    factors = data.draw(
-        st.lists(FACTORS | st.just(0.0), min_size=len(constraints), max_size=len(constraints))
-    )
+    factors = data.draw(st.lists(FACTORS | st.just(0.0), min_size=len(constraints), max_size=len(constraints)))
     assume(any(factors))
     used = [constraint for constraint, factor in zip(constraints, factors, strict=True) if factor]
     combination = Constraint(())

@@ -89,9 +89,7 @@ def test_constraints_over_several_variables_hold_for_random_weights(name, basis,
     assert expression.jet(weights, kappa, FINE, 2).shape == (4, 3, len(FINE), 2)
     scale = what_cancels(expression)
     assert expression.check(weights, kappa).shape == kappa.shape
-    torch.testing.assert_close(
-        expression.check(weights, kappa), torch.zeros_like(kappa), rtol=0, atol=1e-13 * scale
-    )
+    torch.testing.assert_close(expression.check(weights, kappa), torch.zeros_like(kappa), rtol=0, atol=1e-13 * scale)
 
 
 def test_the_relative_constraint_of_a_horizon_by_hand():
@@ -244,9 +242,7 @@ def test_columns_have_unit_rms_of_the_highest_derivative():
 
 @pytest.mark.parametrize("conditioning", ["columns", "orthonormal"])
 def test_functions_that_the_supports_span_are_dropped(conditioning):
-    expression = ConstrainedExpression(
-        Chebyshev(10), hermite(2), nodes=NODES, order=2, conditioning=conditioning
-    )
+    expression = ConstrainedExpression(Chebyshev(10), hermite(2), nodes=NODES, order=2, conditioning=conditioning)
     assert expression.size == 6
     exact = ConstrainedExpression(
         Chebyshev(6, lowest_degree=4), hermite(2), nodes=NODES, order=2, conditioning=conditioning

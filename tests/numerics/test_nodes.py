@@ -122,9 +122,7 @@ def test_interpolation_and_differentiation(kind, n_nodes):
     interpolated = interpolation_matrix(points, targets) @ values
     np.testing.assert_allclose(interpolated, polynomial(targets.numpy()), atol=1e-12)
     slopes = polynomial.deriv()(points.numpy())
-    np.testing.assert_allclose(
-        differentiation_matrix(points) @ values, slopes, atol=1e-11 * np.abs(slopes).max()
-    )
+    np.testing.assert_allclose(differentiation_matrix(points) @ values, slopes, atol=1e-11 * np.abs(slopes).max())
 
 
 def test_interpolation_at_a_node_is_its_value():

@@ -45,8 +45,6 @@ def test_a_jump_is_enclosed():
 
 def test_noise_costs_few_panels():
     generator = np.random.default_rng(0)
-    history = approximate(
-        lambda t: (np.exp(t) + 1e-9 * generator.standard_normal(t.shape))[:, None], 0.0, 1.0
-    )
+    history = approximate(lambda t: (np.exp(t) + 1e-9 * generator.standard_normal(t.shape))[:, None], 0.0, 1.0)
     assert len(history.edges) < 70
     assert float(history(0.5)[0]) == pytest.approx(np.exp(0.5), abs=1e-8)

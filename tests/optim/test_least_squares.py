@@ -214,9 +214,7 @@ def test_small_decrease_waits_for_its_patience(patience):
     assert result.status is Status.SMALL_DECREASE
     before = float(result.records[-patience - 1]["norm"])
     assert (before / float(result.norm)) ** 2 - 1 < 1e-6 * patience
-    longer = LevenbergMarquardt(Stopping(tolerance=0.0, decrease=1e-6, patience=patience + 1)).run(
-        residual, start
-    )
+    longer = LevenbergMarquardt(Stopping(tolerance=0.0, decrease=1e-6, patience=patience + 1)).run(residual, start)
     assert longer.n_iterations > result.n_iterations
 
 
@@ -263,9 +261,7 @@ def test_no_step_helps_up_to_the_largest_damping():
 def test_past_the_tolerance_it_goes_on_until_the_norm_rises():
     residual, start = start_of("rosenbrock")
     met = LevenbergMarquardt(Stopping(tolerance=1e-2)).run(residual, start)
-    past = LevenbergMarquardt(Stopping(tolerance=1e-2, past_tolerance=True, decrease=0.0)).run(
-        residual, start
-    )
+    past = LevenbergMarquardt(Stopping(tolerance=1e-2, past_tolerance=True, decrease=0.0)).run(residual, start)
     # the last trial did not improve on the norm that is reported
     assert met.status is Status.RESIDUAL
     assert past.status is Status.ROUND_OFF
@@ -414,9 +410,7 @@ def test_a_record_per_iteration_with_the_same_entries(optimizer):
         if record["accepted"]:
             assert float(residual.function(xi).norm()) == pytest.approx(record["norm"], rel=1e-12)
 
-    result = OPTIMIZERS[optimizer](Stopping(tolerance=1e-8, max_iterations=40)).run(
-        residual, start, on_iteration
-    )
+    result = OPTIMIZERS[optimizer](Stopping(tolerance=1e-8, max_iterations=40)).run(residual, start, on_iteration)
     assert calls == [(i + 1, 4) for i in range(len(result.records))]
     assert len(calls) > 3
     for record in result.records:

@@ -16,9 +16,10 @@ from ponn_torch.ansatz.basis import Chebyshev
 from ponn_torch.numerics.nodes import differentiation_matrix, make_nodes
 from ponn_torch.optim.base import Stopping
 from ponn_torch.optim.least_squares import LevenbergMarquardt
-from ponn_torch.optimal_control.collocation import Collocation, Discretisation, Strong, Weak, component_names
+from ponn_torch.optimal_control.collocation import Collocation, component_names
 from ponn_torch.optimal_control.control_laws import Regime
 from ponn_torch.optimal_control.curve import Curve
+from ponn_torch.optimal_control.discretisation import Discretisation, Strong, Weak
 from ponn_torch.optimal_control.pontryagin import BoundaryValueProblem, Setting, pontryagin
 from ponn_torch.optimal_control.problem import OptimalControlProblem
 from ponn_torch.solving.guess import project
@@ -43,9 +44,7 @@ def on_times(
     bvp: BoundaryValueProblem, fractions: list[float], events: list[int | None], codes, form=FORMS["strong"]
 ) -> Collocation:
     """Segments between fractions of the final time, on arcs."""
-    disc = Discretisation(
-        bvp, Chebyshev(4), make_nodes("legendre_gauss", 6, dtype=torch.float64), form, "columns"
-    )
+    disc = Discretisation(bvp, Chebyshev(4), make_nodes("legendre_gauss", 6, dtype=torch.float64), form, "columns")
     times = torch.tensor(fractions, dtype=torch.float64) * bvp.final_time
     return with_arcs(Collocation.on_segments(disc, times, events=events), codes)
 
@@ -100,9 +99,7 @@ def test_smoothed_segments_with_parameters_explicit_time_and_terminal_data(name,
 @pytest.mark.parametrize("mass_variable", ["mass", "log_mass", "delta_v"])
 def test_arcs_with_unknown_switches_and_subdivisions(mass_variable, free_final_time, form):
     bvp = pontryagin(ferry(free_final_time=free_final_time), mass_variable=mass_variable)
-    made = on_times(
-        bvp, [0, 0.2, 0.5, 0.6, 0.8, 1.0], [None, 0, None, 0], [[2], [2], [0], [0], [2]], FORMS[form]
-    )
+    made = on_times(bvp, [0, 0.2, 0.5, 0.6, 0.8, 1.0], [None, 0, None, 0], [[2], [2], [0], [0], [2]], FORMS[form])
     assert len(made.free_times) == 2 + free_final_time
     assert jacobian_error(made, unknowns(made)) < 1e-11
 
@@ -153,9 +150,7 @@ def check_members(together: Collocation, members: list[Collocation], xi: Tensor)
         torch.testing.assert_close(residual.reshape(len(flat), -1)[i], alone, rtol=1e-12, atol=1e-12)
         torch.testing.assert_close(dense[i], alone_jacobian.dense(), rtol=1e-12, atol=1e-12)
         for name, norm in member.blocks(alone).items():
-            assert float(together.blocks(residual)[name].flatten()[i]) == pytest.approx(
-                float(norm), rel=1e-11
-            )
+            assert float(together.blocks(residual)[name].flatten()[i]) == pytest.approx(float(norm), rel=1e-11)
 
 
 @pytest.mark.parametrize("form", FORMS)
@@ -168,9 +163,7 @@ def test_a_batch_of_unknowns(name, batch, form):
 
 @pytest.mark.parametrize("free_final_time", [False, True])
 def test_a_batch_of_smoothings_and_parameters(free_final_time):
-    made = collocation(
-        pontryagin(ferry(free_final_time=free_final_time)), n_neurons=4, n_nodes=6, n_segments=2
-    )
+    made = collocation(pontryagin(ferry(free_final_time=free_final_time)), n_neurons=4, n_nodes=6, n_segments=2)
     values = {
         "smoothing": torch.tensor([1.0, 0.3, 0.05], dtype=torch.float64),
         "thrust": torch.tensor([4.0, 5.0, 3.0], dtype=torch.float64),
@@ -253,9 +246,7 @@ def test_blocks_part_the_residual(name):
 
 
 def test_subdivisions_stay_at_their_fraction_between_switches():
-    made = on_times(
-        pontryagin(ferry(free_final_time=True)), [0, 0.2, 0.5, 0.8, 1.0], [None, 0, None], [[2]] * 4
-    )
+    made = on_times(pontryagin(ferry(free_final_time=True)), [0, 0.2, 0.5, 0.8, 1.0], [None, 0, None], [[2]] * 4)
     xi = unknowns(made)
     parts = made.unpack(xi)
     switch, end = 1.1 * float(parts.times[2]), 1.3 * float(parts.times[4])
@@ -303,9 +294,7 @@ def test_ends_and_knots_are_met_by_random_weights(name, mass_variable, n_segment
         for chain in bvp.chains:
             for e, (column, after) in enumerate(zip(chain.columns[:-1], chain.columns[1:], strict=True)):
                 slope = chain.factors[e + 1] / chain.factors[e]
-                assert float((rate[:, column] - slope * w[:, after]).abs().max()) < 1e-12 * float(
-                    rate.abs().max()
-                )
+                assert float((rate[:, column] - slope * w[:, after]).abs().max()) < 1e-12 * float(rate.abs().max())
 
 
 # -- exact solutions -----------------------------------------------------------------------------------------

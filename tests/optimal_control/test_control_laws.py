@@ -158,9 +158,7 @@ def test_the_switching_function_of_a_thrust_ball_is_that_of_the_paper():
     best = law.minimise(thrust_hamiltonian(primer, mass_costate), NONE, column(1.0), Regime())
     # S = |λv|/(α m) + λm − 1
     assert float(best.switching) == pytest.approx(1.3 / (ALPHA * MASS) + mass_costate - 1, rel=1e-14)
-    assert best.control["thrust"][0].tolist() == pytest.approx(
-        [-2 * 0.3 / 1.3, 2 * 0.4 / 1.3, -2 * 1.2 / 1.3]
-    )
+    assert best.control["thrust"][0].tolist() == pytest.approx([-2 * 0.3 / 1.3, 2 * 0.4 / 1.3, -2 * 1.2 / 1.3])
 
 
 def test_a_switching_level_shifts_the_smoothed_law_only():
@@ -201,9 +199,7 @@ def test_a_convex_hamiltonian_is_minimised_by_clipping(size, minimum):
     assert law.curved
     assert law.n_switching == 2
     best = law.minimise(h, NONE, column(1.0), Regime())
-    assert float(best.control["thrust_magnitude"]) == pytest.approx(
-        min(max(size / 0.5, minimum), 2.0), rel=1e-12
-    )
+    assert float(best.control["thrust_magnitude"]) == pytest.approx(min(max(size / 0.5, minimum), 2.0), rel=1e-12)
     code = int(law.arc_codes(best.switching))
     # on the arc that the two switching functions name, the control is the same
     pinned = law.minimise(h, NONE, column(1.0), Regime(arcs=torch.tensor([[code]])))
@@ -241,9 +237,7 @@ def separable(slopes: Tensor, curvatures: Tensor):
 @given(slopes=st.lists(st.floats(-3, 3), min_size=3, max_size=3), seed=st.integers(0, 1000))
 def test_every_component_of_a_box_minimises_its_part(regulariser, slopes, seed):
     h, rho = affine(tensor([slopes])), column(0.3)
-    law = adapted(
-        Box("u", 2.0, -1.0, make_regulariser(regulariser), size=3), affine(tensor([1.0, 2.0, 3.0])), None
-    )
+    law = adapted(Box("u", 2.0, -1.0, make_regulariser(regulariser), size=3), affine(tensor([1.0, 2.0, 3.0])), None)
     best = law.minimise(h, NONE, column(1.0), Regime(smoothing=rho))
     assert not law.curved
     assert law.cost_rate == pytest.approx(1 / 3)  # the scale of H over the range
@@ -273,9 +267,7 @@ def test_a_convex_box_is_clipped_component_by_component(slopes):
 
 def test_a_box_with_a_coupled_hamiltonian_is_refused():
     with pytest.raises(ValueError, match="u: the Hamiltonian couples its components"):
-        adapted(
-            Box("u", 1.0, -1.0, size=2), lambda u: (u[..., :1] * u[..., 1:]) + u.sum(-1, keepdim=True), None
-        )
+        adapted(Box("u", 1.0, -1.0, size=2), lambda u: (u[..., :1] * u[..., 1:]) + u.sum(-1, keepdim=True), None)
 
 
 def test_impossible_box_bounds_are_named():

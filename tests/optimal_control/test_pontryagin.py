@@ -358,9 +358,7 @@ def test_terminal_rows_by_hand():
 
 
 def test_a_terminal_cost_decides_the_costates_of_free_states_only():
-    made = interception().with_boundary(
-        final={"x": (1.0, None), "v": 0.0}, terminal_manifold=None, final_time=1.0
-    )
+    made = interception().with_boundary(final={"x": (1.0, None), "v": 0.0}, terminal_manifold=None, final_time=1.0)
     bvp = pontryagin(made)
     assert bvp.terminal_components == [1]
     assert bvp.n_terminal_rows == 1
@@ -380,9 +378,7 @@ def test_minimum_time_has_the_row_h_equals_zero():
 def test_mass_variables_are_checked():
     with pytest.raises(ValueError, match=r"mass_variable = 'log_mas'; .*did you mean 'log_mass'"):
         pontryagin(problem("earth_mars"), mass_variable="log_mas")
-    with pytest.raises(
-        ValueError, match="mass_variable = 'delta_v', but problem 'energy_transfer' names no mass"
-    ):
+    with pytest.raises(ValueError, match="mass_variable = 'delta_v', but problem 'energy_transfer' names no mass"):
         pontryagin(problem("energy_transfer"), mass_variable="delta_v")
 
 

@@ -99,9 +99,7 @@ def test_an_end_of_mass_below_zero_has_no_logarithm():
 
 
 def test_a_law_without_closed_form_is_refused():
-    made = OptimalControlProblem(
-        **statement(running_cost=lambda t, x, u, p: (u.force**4).sum(-1, keepdim=True))
-    )
+    made = OptimalControlProblem(**statement(running_cost=lambda t, x, u, p: (u.force**4).sum(-1, keepdim=True)))
     with pytest.raises(ValueError, match="'force': the Hamiltonian is not quadratic"):
         pontryagin(made)
 

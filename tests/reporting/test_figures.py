@@ -95,9 +95,7 @@ def test_control_figure_shows_jumps_bounds_and_the_switching_function(solved):
     assert [text.get_text() for text in thrust.texts] == solution.arcs
     s = max(switching.get_lines(), key=lambda line: len(line.get_xdata())).get_ydata()
     assert close(s, solution.sample().switching[:, 0])
-    components = [
-        np.asarray(line.get_ydata()) for line in direction.get_lines() if line.get_label()[0] == "$"
-    ]
+    components = [np.asarray(line.get_ydata()) for line in direction.get_lines() if line.get_label()[0] == "$"]
     assert np.allclose(sum(c**2 for c in components), 1.0)
 
 
@@ -109,19 +107,13 @@ def test_plane_leaves_out_the_third_axis_of_a_flat_path_only(solved):
 
 def test_path_starts_and_ends_where_the_problem_says(solved):
     figure = trajectory_figure(solved("split").solution)
-    marks = {
-        line.get_marker(): line.get_data_3d()
-        for line in figure.axes[0].get_lines()
-        if line.get_marker() in "os"
-    }
+    marks = {line.get_marker(): line.get_data_3d() for line in figure.axes[0].get_lines() if line.get_marker() in "os"}
     assert np.allclose(np.ravel(marks["o"]), [-200.0, 100.0, 1500.0])
     assert np.allclose(np.ravel(marks["s"]), 0.0, atol=1e-6)
 
 
 def test_residual_figure_leaves_out_equations_that_hold_exactly(solved):
-    labels = [
-        text.get_text() for text in residual_figure(solved("split").solution).axes[0].get_legend().get_texts()
-    ]
+    labels = [text.get_text() for text in residual_figure(solved("split").solution).axes[0].get_legend().get_texts()]
     assert r"$\dot v$" in labels
     assert r"$\dot r$" not in labels  # chained: ṙ = v by construction
 

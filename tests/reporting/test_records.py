@@ -90,9 +90,7 @@ def test_one_run_with_its_hyperparameters_and_a_figure(runs, name):
     assert set(values) == {"problem", "optimizer.damping", "optimizer.geodesic", "seed"}
     assert values["optimizer.damping"].number_value == 1e-3
     assert values["optimizer.geodesic"].string_value == "False"
-    metrics = plugin_data_pb2.HParamsPluginData.FromString(
-        plugin["_hparams_/experiment"]
-    ).experiment.metric_infos
+    metrics = plugin_data_pb2.HParamsPluginData.FromString(plugin["_hparams_/experiment"]).experiment.metric_infos
     assert {metric.name.tag for metric in metrics} <= set(accumulator.Tags()["scalars"])
     (image,) = accumulator.Images("stage/control")
     assert image.encoded_image_string.startswith(b"\x89PNG")
@@ -137,9 +135,7 @@ def test_what_is_costly_is_evaluated_once_and_only_when_due(tmp_path):
     calls = []
     with RunRecorder(tmp_path, progress=False, cost_every=2, figures=False) as recorder:
         for _ in range(4):
-            recorder.iteration(
-                record(), lambda: calls.append("blocks") or {}, lambda: calls.append("cost") or 1.0
-            )
+            recorder.iteration(record(), lambda: calls.append("blocks") or {}, lambda: calls.append("cost") or 1.0)
     assert (calls.count("blocks"), calls.count("cost")) == (4, 2)
     with pytest.raises(ValueError, match="cost_every = -1"):
         RunRecorder(tmp_path, cost_every=-1)

@@ -9,9 +9,10 @@ from ponn_torch.ansatz.basis import Chebyshev
 from ponn_torch.numerics.nodes import make_nodes
 from ponn_torch.optim.base import Stopping
 from ponn_torch.optim.least_squares import LevenbergMarquardt
-from ponn_torch.optimal_control.collocation import Collocation, Discretisation
+from ponn_torch.optimal_control.collocation import Collocation
 from ponn_torch.optimal_control.control_laws import Regime
 from ponn_torch.optimal_control.curve import Curve
+from ponn_torch.optimal_control.discretisation import Discretisation
 from ponn_torch.optimal_control.pontryagin import Setting, pontryagin
 from ponn_torch.optimal_control.problem import load_problem
 from ponn_torch.solving.guess import RandomGuess, project
@@ -39,9 +40,7 @@ def split_landing(smoothed_landing: Solution) -> Solution:
     """The landing on its three arcs, from switches rounded to a second."""
     bvp = smoothed_landing.bvp
     disc = Discretisation(bvp, Chebyshev(20), make_nodes("legendre_gauss", 30), conditioning="columns")
-    times = (
-        torch.tensor([0.0, 31.0, 39.0, bvp.final_time * bvp.time_unit], dtype=torch.float64) / bvp.time_unit
-    )
+    times = torch.tensor([0.0, 31.0, 39.0, bvp.final_time * bvp.time_unit], dtype=torch.float64) / bvp.time_unit
     setting = Setting(Regime(arcs=torch.tensor([[2], [0], [2]])))
     collocation = Collocation.on_segments(disc, times, events=[0, 0], setting=setting)
     xi = project(collocation, smoothed_landing.curve)

@@ -221,9 +221,7 @@ def test_no_layer_is_flown_over(width):
     history = approximate(lambda t: step(t)[:, None], 0.0, 1.0)
     flight = fly(lambda t, y, k: step(np.array([t])), [0.0, 1.0], np.zeros(1), [history])
     # ∫ tanh((t − c)/w) = w [ln cosh], and ln cosh x = |x| − ln 2 for large x
-    exact = width * (
-        np.logaddexp(0.563 / width, -0.563 / width) - np.logaddexp(0.437 / width, -0.437 / width)
-    )
+    exact = width * (np.logaddexp(0.563 / width, -0.563 / width) - np.logaddexp(0.437 / width, -0.437 / width))
     assert flight.arrived
     assert flight.y[-1, 0] == pytest.approx(exact, abs=1e-11)
 

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ponn_torch.optimal_control.collocation import Weak
+from ponn_torch.optimal_control.discretisation import Weak
 from ponn_torch.solving.continuation import Adaptive, Ladder, Outcome, Phases, Schedule, Single, log_ladder
 
 

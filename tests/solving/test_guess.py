@@ -166,9 +166,7 @@ PATHS = [
 @pytest.mark.parametrize(("guess", "name"), PATHS)
 def test_paths_start_and_end_where_they_must_and_costates_follow(guess, name):
     _, t, x, costates = sampled(guess, name)
-    r0, rf = (
-        torch.tensor(problem(name).boundary(end)[:3], dtype=torch.float64) for end in ("initial", "final")
-    )
+    r0, rf = (torch.tensor(problem(name).boundary(end)[:3], dtype=torch.float64) for end in ("initial", "final"))
     size = float((rf - r0).norm())
     assert float((x[0, :3] - r0).norm()) < 1e-11 * size
     assert float((x[-1, :3] - rf).norm()) < 1e-11 * size

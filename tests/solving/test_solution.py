@@ -68,9 +68,7 @@ def test_samples_of_the_minimum_energy_transfer_are_its_polynomials():
     assert solution.off_node_residual < 1e-11
 
 
-@pytest.mark.parametrize(
-    "t", [0.25, [0.25], np.array([0.25]), torch.tensor([0.25])], ids=lambda t: type(t).__name__
-)
+@pytest.mark.parametrize("t", [0.25, [0.25], np.array([0.25]), torch.tensor([0.25])], ids=lambda t: type(t).__name__)
 def test_times_may_be_numbers_lists_arrays_or_tensors(t):
     assert float(solve(minimum_energy(), REST)(t).states["x"]) == pytest.approx(3 / 16 - 1 / 32, abs=1e-13)
 
@@ -211,9 +209,7 @@ def test_float32_stays_float32(tmp_path):
 def test_a_problem_without_origin_has_to_be_passed(tmp_path):
     solution = solve(minimum_energy(), REST)
     solution.save(tmp_path)
-    with pytest.raises(
-        ValueError, match=r"not made by load_problem.*pass it: Solution.load\(folder, problem="
-    ):
+    with pytest.raises(ValueError, match=r"not made by load_problem.*pass it: Solution.load\(folder, problem="):
         Solution.load(tmp_path)
     assert Solution.load(tmp_path, minimum_energy()).cost == solution.cost
 
@@ -280,9 +276,7 @@ def test_the_trajectory_is_written_with_units(split_landing, tmp_path):
 
 
 def test_arguments_are_kept_as_json_gives_them_back():
-    problem = load_problem(
-        "ponn_torch.problems.mars_landing:mars_landing", initial_position=(-100.0, 50.0, 1200.0)
-    )
+    problem = load_problem("ponn_torch.problems.mars_landing:mars_landing", initial_position=(-100.0, 50.0, 1200.0))
     assert problem.origin.arguments == {"initial_position": [-100.0, 50.0, 1200.0]}
     json.dumps(dict(problem.origin.arguments))
 

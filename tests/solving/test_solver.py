@@ -138,9 +138,7 @@ def test_published_problems_are_solved_to_their_answers(name):
     for state, expected in answer.costates.items():
         found = start.costates[state].flatten() / answer.costate_units.get(state, 1.0)
         largest = max(abs(x) for x in expected)
-        assert found.tolist() == pytest.approx(
-            expected, rel=0, abs=answer.costate_tolerance * max(1.0, largest)
-        )
+        assert found.tolist() == pytest.approx(expected, rel=0, abs=answer.costate_tolerance * max(1.0, largest))
         assert found.tolist() == pytest.approx(expected, rel=0, abs=1e-6 * largest)
     if answer.hamiltonian is not None:
         times = torch.linspace(0, solution.final_time, 9, dtype=torch.float64)
@@ -280,9 +278,7 @@ def test_even_nodes_with_twice_as_many_as_neurons_fail_between_the_nodes():
     assert even.stages[-1].off_node_residual > 1.0
     assert not even.certified
     assert "off node residual" in even.message
-    assert (
-        "no stage solves its own problem between the nodes" in even.message or "NOT certified" in even.message
-    )
+    assert "no stage solves its own problem between the nodes" in even.message or "NOT certified" in even.message
     assert good.stages[-1].off_node_residual < 1e-7
     assert good.solution.cost == pytest.approx(272.1667469489, abs=1e-5)
 

@@ -1,0 +1,183 @@
+"""What a collocation residual is tabulated from: nodes, test functions, and the chains' constrained expressions.
+
+Nothing here depends on unknowns, times or boundary values, so one discretisation serves every residual of a boundary
+value problem, whatever its segments.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import torch
+from torch import Tensor
+from torch.func import vjp, vmap
+
+from ponn_torch.ansatz.basis import LinearBasis
+from ponn_torch.ansatz.constraints import hermite
+from ponn_torch.ansatz.expression import ConstrainedExpression
+from ponn_torch.numerics.nodes import NodeSet, legendre_moments
+from ponn_torch.optimal_control.pontryagin import BoundaryValueProblem, Chain, probe_points, probe_settings
+
+# -- test functions: how the pointwise residual becomes rows ---------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Strong:
+    """Pointwise rows √w_i R(z_i), so that their sum of squares is the integral of R²."""
+
+    def matrix(self, nodes: NodeSet) -> Tensor:
+        return torch.diag(nodes.weights.sqrt())
+
+
+@dataclass(frozen=True)
+class Weak:
+    """Moments ⟨R, P_k⟩/(1+k)^decay with orthonormal Legendre P_k, k < n_moments (all nodes if None).
+
+    A residual with a jump has slowly falling moments; the decay keeps them from governing the fit.
+    """
+
+    decay: float = 1.0
+    n_moments: int | None = None
+
+    def matrix(self, nodes: NodeSet) -> Tensor:
+        moments = legendre_moments(nodes, self.n_moments or len(nodes))
+        degree = torch.arange(1, moments.shape[0] + 1, dtype=moments.dtype, device=moments.device)
+        return moments / degree.unsqueeze(-1) ** self.decay
+
+
+Form = Strong | Weak
+
+
+# -- tables: all that does not depend on unknowns --------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class Group:
+    """Chains of one length that share tables; a trivial one has no free function.
+
+    columns (d, q) of w, factors (d, q): y^(e) = factors[e] w[columns[e]]; table (L + 2q, (q+1) n) gives all derivatives
+    at all nodes from [β, κ] in one product; own and rows locate β and the equations inside a segment, active the
+    equations among those that use F; pointwise (n,) is the diagonal of the test matrix where it is one.
+    """
+
+    order: int
+    trivial: bool
+    columns: Tensor
+    factors: Tensor
+    expression: ConstrainedExpression
+    size: int
+    B: Tensor
+    Omega: Tensor
+    table: Tensor
+    test: Tensor
+    own: slice
+    rows: slice
+    active: slice
+    pointwise: Tensor | None
+
+    @property
+    def n_chains(self) -> int:
+        return self.columns.shape[0]
+
+
+@dataclass(frozen=True, eq=False)
+class Discretisation:
+    """Basis, nodes and form, tabulated for the chains of a boundary value problem; shared by all its residuals."""
+
+    bvp: BoundaryValueProblem
+    basis: LinearBasis
+    nodes: NodeSet
+    form: Form = field(default_factory=Strong)
+    conditioning: str = "orthonormal"
+
+    @cached_property
+    def groups(self) -> tuple[Group, ...]:
+        groups: list[Group] = []
+        kinds = sorted({(len(c.columns), c.trivial) for c in self.bvp.chains})
+        for order, trivial in kinds:
+            chains = [c for c in self.bvp.chains if (len(c.columns), c.trivial) == (order, trivial)]
+            groups.append(self._group(order, trivial, chains, groups[-1] if groups else None))
+        return tuple(groups)
+
+    def _group(self, order: int, trivial: bool, chains: Sequence[Chain], before: Group | None) -> Group:
+        nodes, like = self.nodes, self.nodes.points
+        expression = ConstrainedExpression(
+            self.basis.beyond(2 * order),
+            hermite(order),
+            nodes=nodes,
+            order=order,
+            conditioning=self.conditioning,
+            dtype=like.dtype,
+            device=like.device,
+        )
+        B, Omega = expression.tables(like, order)
+        # a trivial chain is the Hermite interpolant, of degree 2q−1: y^(q) = 0 has q coefficients to be met
+        test = legendre_moments(nodes, order) if trivial else self.form.matrix(nodes)
+        B = B[..., :0] if trivial else B
+        size, used = B.shape[-1], 0 if trivial else len(chains)
+        own, rows, active = (before.own.stop, before.rows.stop, before.active.stop) if before else (0, 0, 0)
+        return Group(
+            order=order,
+            trivial=trivial,
+            columns=torch.tensor([c.columns for c in chains], device=like.device),
+            factors=torch.tensor([c.factors for c in chains], dtype=like.dtype, device=like.device),
+            expression=expression,
+            size=size,
+            B=B,
+            Omega=Omega,
+            table=torch.cat([B, Omega], -1).movedim(-1, 0).flatten(1),
+            test=test,
+            own=slice(own, own + len(chains) * size),
+            rows=slice(rows, rows + len(chains) * test.shape[0]),
+            active=slice(active, active + used),
+            pointwise=test.diagonal() if isinstance(self.form, Strong) and not trivial else None,
+        )
+
+    @property
+    def n_own(self) -> int:
+        """Coefficients per segment."""
+        return self.groups[-1].own.stop
+
+    @property
+    def n_rows(self) -> int:
+        """Equations per segment."""
+        return self.groups[-1].rows.stop
+
+    @cached_property
+    def order_of_columns(self) -> Tensor:
+        """Permutation from [group, derivative, chain] to the columns of w."""
+        columns = torch.cat([g.columns.mT.flatten() for g in self.groups])
+        return torch.argsort(columns)
+
+    @cached_property
+    def last_columns(self) -> Tensor:
+        """Columns of F that the non-trivial chains' equations use, in the order of the groups."""
+        none = torch.zeros(0, dtype=torch.long, device=self.nodes.points.device)
+        return torch.cat([none, *(g.columns[:, -1] for g in self.groups if not g.trivial)])
+
+    @cached_property
+    def couplings(self) -> Tensor:
+        """Boolean (2n, 2n): F_i depends on w_j, found at random points."""
+        bvp, found = self.bvp, []
+        t, w = probe_points(bvp, 16, seed=1)
+        seeds = torch.eye(bvp.dimension, dtype=w.dtype, device=w.device)
+        for setting in probe_settings(bvp, t):
+            rates, pull, *_ = vjp(lambda w, setting=setting: bvp.rates(t, w, setting), w)
+            by_w = vmap(lambda seed, rates=rates, pull=pull: pull(seed.expand_as(rates))[0])(seeds)
+            found.append(by_w.abs().amax(1) > 0)
+        return torch.stack(found).any(0)
+
+    def active_orders(self, group: Group, other: Group) -> list[int]:
+        """Derivatives e of the other group's chains that this group's equations depend on."""
+        return self._active_orders[self.groups.index(group), self.groups.index(other)]
+
+    @cached_property
+    def _active_orders(self) -> dict[tuple[int, int], list[int]]:
+        out = {}
+        for i, group in enumerate(self.groups):
+            for j, other in enumerate(self.groups):
+                depends = self.couplings[group.columns[:, -1]][:, other.columns].any(0).any(0).tolist()
+                out[i, j] = [] if group.trivial else [e for e in range(other.order) if depends[e]]
+        return out

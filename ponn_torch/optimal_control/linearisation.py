@@ -1,0 +1,140 @@
+"""The exact Jacobian of a collocation residual, block by block.
+
+F is differentiated at the nodes only: vmapped vjp gives ∂F_i/∂w for the equations in use, and the tables pull these
+cotangents back to coefficients and knots. Times enter by the chain rule through the half lengths. Nothing of the size
+of the whole Jacobian is differentiated, which is what makes it cheap.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+from torch.func import vjp, vmap
+
+from ponn_torch.numerics.linalg import ArrowJacobian
+from ponn_torch.optimal_control.discretisation import Discretisation, Group
+
+if TYPE_CHECKING:
+    from ponn_torch.optimal_control.collocation import Collocation
+
+
+def linearise(collocation: Collocation, xi: Tensor) -> tuple[Tensor, ArrowJacobian]:
+    """r (..., R) and J at ξ (..., N)."""
+    disc, width = collocation.discretisation, collocation.bvp.dimension
+    unknowns = collocation.unpack(xi)
+    h = (unknowns.times[..., 1:] - unknowns.times[..., :-1]) / 2
+    jets, kappas, factors = collocation.jets(unknowns, h)
+    t, w = collocation.points(jets, unknowns.times, h)
+    rates, by_t, by_w = _rates_and_slopes(collocation, t, w)
+
+    batch, k = xi.shape[:-1], collocation.n_segments
+    local = xi.new_zeros(*batch, k, disc.n_rows, disc.n_own)
+    shared = xi.new_zeros(*batch, k, disc.n_rows, 2 * width + 2)
+    by_h = _by_half_length(collocation, jets, kappas, h, rates, by_t, by_w)
+    f, g = (fraction[:, None, None] for fraction in collocation.end_fractions)
+    for group, stretch in zip(disc.groups, by_h, strict=True):
+        # the equations are y^(q) − scale F, (..., K, d); those of a trivial group have no F
+        scale = h[..., None] ** group.order * (group.factors[:0, -1] if group.trivial else group.factors[:, -1])
+        cotangents = -scale[..., None, :, None] * by_w[..., group.active, :]
+        _pull_back(disc, group, cotangents, h, factors, local, shared, width)
+        # h = (t₁ − t₀)/2 and t = t₀ + h (z + 1): what depends on t apart from h moves with t₀
+        drift = torch.zeros_like(stretch) if group.trivial else -scale[..., None] * by_t[..., group.active].mT
+        by_start, by_end = drift - 0.5 * stretch, 0.5 * stretch
+        anchors = torch.stack([(1 - f) * by_start + (1 - g) * by_end, f * by_start + g * by_end], -1)
+        shared[..., group.rows, -2:] = (group.test @ anchors).flatten(-3, -2)
+
+    extra_rows, extra = collocation.extra_linearised(unknowns)
+    residual = torch.cat([collocation.equations(jets, h, rates).flatten(-2), extra_rows], -1)
+    return residual, ArrowJacobian(local, shared, extra, collocation.shared_index)
+
+
+def _rates_and_slopes(collocation: Collocation, t: Tensor, w: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """F (..., 2n) at the nodes and, for the equations in use, ∂F/∂t (..., rows) and ∂F/∂w (..., rows, 2n)."""
+    bvp, shape = collocation.bvp, w.shape
+    setting = collocation.point_setting(shape[:-1])
+    points = t.reshape(-1, 1), w.reshape(-1, shape[-1])
+    rates, pull, *_ = vjp(lambda t, w: bvp.rates(t, w, setting), *points)
+    rows = collocation.discretisation.last_columns
+    if not len(rows):
+        return rates.view(shape), w[..., :0], w.unsqueeze(-2)[..., :0, :]
+    seeds = torch.eye(shape[-1], dtype=w.dtype, device=w.device)[rows]
+    by_t, by_w = vmap(lambda seed: pull(seed.expand_as(rates)))(seeds)
+    return (
+        rates.view(shape),
+        by_t[..., 0].movedim(0, -1).reshape(*shape[:-1], len(rows)),
+        by_w.movedim(0, -2).reshape(*shape[:-1], len(rows), shape[-1]),
+    )
+
+
+def _by_half_length(
+    collocation: Collocation,
+    jets: Sequence[Tensor],
+    kappas: Sequence[Tensor],
+    h: Tensor,
+    rates: Tensor,
+    by_t: Tensor,
+    by_w: Tensor,
+) -> list[Tensor]:
+    """Derivative of each group's pointwise equations (..., K, d, n) with respect to h at fixed β and knots."""
+    disc, per_length = collocation.discretisation, 1.0 / h[..., None, None]
+    moved, tops = [], []
+    for group, jet, kappa in zip(disc.groups, jets, kappas, strict=True):
+        powers = torch.arange(group.order, dtype=h.dtype, device=h.device).repeat(2)
+        # κ_e carries h^e
+        by_h = torch.einsum("onk,...dk->...don", group.Omega, powers * kappa) * per_length[..., None]
+        for e in range(group.order):
+            scale = (h[..., None] ** e * group.factors[:, e])[..., None]
+            moved.append((by_h[..., e, :] - e * per_length * jet[..., e, :]) / scale)
+        tops.append(by_h[..., -1, :])
+    by_points = (by_w @ collocation.assemble(moved).unsqueeze(-1)).squeeze(-1)
+    total = by_points + by_t * (disc.nodes.points + 1.0)[:, None]
+    out = []
+    for group, top in zip(disc.groups, tops, strict=True):
+        if not group.trivial:
+            scale = h[..., None] ** group.order * group.factors[:, -1]
+            growth = group.order * per_length * rates[..., group.columns[:, -1]].mT
+            top = top - scale[..., None] * (growth + total[..., group.active].mT)
+        out.append(top)
+    return out
+
+
+def _pull_back(
+    disc: Discretisation,
+    group: Group,
+    cotangents: Tensor,
+    h: Tensor,
+    kappa_factors: Sequence[Tensor],
+    local: Tensor,
+    shared: Tensor,
+    width: int,
+) -> None:
+    """Fill this group's rows of ``local`` and ``shared`` from ∂(pointwise equations)/∂w (..., K, n, d, 2n)."""
+    pointwise = group.pointwise  # √weights where rows are points: then no product with a test matrix is needed
+    for other, factor in zip(disc.groups, kappa_factors, strict=True):
+        shape = (*local.shape[:-2], group.n_chains, group.test.shape[0], other.n_chains)
+        by_own = (
+            local[..., group.rows, other.own].unflatten(-2, shape[-3:-1]).unflatten(-1, (other.n_chains, other.size))
+        )
+        by_kappa = local.new_zeros(*shape, 2 * other.order)
+        for e in disc.active_orders(group, other):
+            scale = h[..., None] ** e * other.factors[:, e]
+            # (..., K, d, n, d'): equation, node, chain that it depends on
+            c = (cotangents[..., other.columns[:, e]] / scale[..., None, None, :]).transpose(-3, -2)
+            if pointwise is not None:
+                c = (c * pointwise[:, None]).unsqueeze(-1)
+                by_own.addcmul_(c, other.B[e].unsqueeze(-2))
+                by_kappa.addcmul_(c, other.Omega[e].unsqueeze(-2))
+            else:
+                tables = torch.cat([other.B[e], other.Omega[e]], -1).unsqueeze(-2)
+                block = group.test @ (c.unsqueeze(-1) * tables).flatten(-2)
+                block = block.unflatten(-1, (other.n_chains, other.size + 2 * other.order))
+                by_own.add_(block[..., : other.size])
+                by_kappa.add_(block[..., other.size :])
+        if other is group:
+            by_own.diagonal(dim1=-4, dim2=-2).add_((group.test @ group.B[-1]).unsqueeze(-1))
+            by_kappa.diagonal(dim1=-4, dim2=-2).add_((group.test @ group.Omega[-1]).unsqueeze(-1))
+        index = torch.cat([other.columns, other.columns + width], -1).flatten()
+        shared[..., group.rows, index] = (by_kappa * factor[..., None, None, :, :]).flatten(-4, -3).flatten(-2)
