@@ -104,7 +104,8 @@ def _key(solution: Solution, path: _Path) -> list[Line2D]:
         marks.append(Line2D([], [], color=ORANGE, mec=BLACK, mew=0.4, marker="*", ms=11, ls="", label=name))
     present = [arc for arc in ARCS if arc in solution.arcs]
     arcs = [Line2D([], [], color=ARCS[arc], lw=2, label=f"{arc} arc") for arc in present]
-    arrow = [Line2D([], [], color=BLACK, marker=r"$\rightarrow$", ms=11, ls="", alpha=0.7)]
+    look: Any = {"color": BLACK, "marker": r"$\rightarrow$", "ms": 11, "ls": "", "alpha": 0.7}
+    arrow = [Line2D([], [], label=path.name_of_arrows, **look)]
     return [*marks, *arcs, *(arrow if len(path.feet) else [])]
 
 
