@@ -205,11 +205,12 @@ def _screen(outcome: Outcome, folder: Path, plan: Plan | None, keeper: _Keeper, 
     lines, certificate = [""], keeper.judged
     if certificate is not None:
         text = certificate.to_text().splitlines()
-        # its lines on cost and time come below, with units
-        last = next((i for i, line in enumerate(text) if line.startswith(f"{certificate.cost_name}: ")), None)
+        # its lines on end errors, cost and time come below, with units
+        starts = ("end error of ", f"{certificate.cost_name}: ")
+        last = next((i for i, line in enumerate(text) if line.startswith(starts)), None)
         # the progress has shown the verdict, which opens the table
         first = 2 if plan is not None and plan.recording.progress else 0
-        lines += [*text[first:last], ""]
+        lines += ["\n".join(text[first:last]).rstrip(), ""]
     if plan is not None and outcome.cost is not None:
         display, name = plan.problem.display, plan.problem.cost_name
         cost, clock = display.get("cost", DisplayUnit("")), display.get("time", DisplayUnit("s"))
@@ -224,6 +225,11 @@ def _screen(outcome: Outcome, folder: Path, plan: Plan | None, keeper: _Keeper, 
         if outcome.switch_times:
             times = ", ".join(f"{time / clock.size:.9g}" for time in outcome.switch_times)
             lines.append(f"{'switches':12}{times} {clock.label} ({'-'.join(outcome.arcs)})")
+    if plan is not None and certificate is not None:
+        for name, flown in certificate.end_errors.items():
+            shown, alone = plan.problem.display.get(name, DisplayUnit("")), certificate.control_end_errors[name]
+            errors = (f"{value / shown.size:.1e} {shown.label}".rstrip() for value in (flown, alone))
+            lines.append("{:12}{} flown, {} by the control alone".format(f"end of {name}", *errors))
     solving = sum(stage.cpu_seconds for stage in keeper.stages)
     lines.append(f"{'CPU time':12}{solving:.1f} s solving, {seconds:.1f} s in all")
     lines.append(f"{'folder':12}{folder}")

@@ -91,5 +91,6 @@ def earth_mars(
             "m": DisplayUnit("kg"),
             "cost": DisplayUnit("kg"),
             "thrust": DisplayUnit("N"),
+            "origin": DisplayUnit("Sun"),
         },
     )

@@ -23,6 +23,7 @@ _DISPLAY = {
     "r": DisplayUnit("km", KILOMETRE),
     "v": DisplayUnit("km/s", KILOMETRE),
     "m": DisplayUnit("kg"),
+    "origin": DisplayUnit("Sun"),
 }
 
 
