@@ -16,7 +16,8 @@ from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 
 from ponn_torch.ansatz.basis import LinearBasis
 from ponn_torch.optimal_control.pontryagin import pontryagin
-from ponn_torch.optimal_control.problem import OptimalControlProblem, load_problem, nearest
+from ponn_torch.optimal_control.problem import OptimalControlProblem, nearest
+from ponn_torch.optimal_control.references import load_problem
 from ponn_torch.settings import (
     KINDS,
     ROOMS,

@@ -122,7 +122,7 @@ class Collocation:
 
     @cached_property
     def _fractions(self) -> Tensor:
-        """(K+1,): how far a knot lies from the anchor before it to the one after."""
+        """(K+1,): how far a knot lies between its anchors; a batch takes those of its first member."""
         known = self.known_times.reshape(-1, self.n_segments + 1)[0]
         start, end = known[self._anchors]
         return torch.where(end > start, (known - start) / (end - start), torch.zeros_like(known))

@@ -70,7 +70,7 @@ class Segmentation:
         n_neurons, n_nodes: size of a segment. n_segments: how many the first round has, about.
         basis: the free function of a segment (Legendre by default).
         residual_tolerance: ‖r‖ above which a round has failed.
-        off_node_tolerance: largest |ẇ − F| off the nodes, scaled.
+        off_node_tolerance: largest |ẇ − F| off the nodes, scaled, weighted by the segment's share of the time.
     """
 
     n_neurons: int = 14
@@ -105,6 +105,15 @@ class Segmentation:
     def solved(self, result: OptimizeResult) -> bool:
         return float(result.norm) < self.residual_tolerance
 
+    def coarse(self, curve: Curve) -> Tensor:
+        """Segments (K,) whose equations do not hold between the nodes.
+
+        A segment's residual counts by its share of the time, as it does in what is flown: on an arc of a thousandth of
+        the whole, round-off alone in its second derivatives is above any tight tolerance.
+        """
+        share = (curve.times[1:] - curve.times[:-1]) / (curve.times[-1] - curve.times[0])
+        return curve.off_node_residuals() * share * self.n_segments > self.off_node_tolerance
+
 
 @dataclass(frozen=True)
 class Subdivide(Segmentation):
@@ -129,11 +138,11 @@ class Subdivide(Segmentation):
                 return Refined(solution, Outcome.INTERRUPTED, rounds)
             if self.solved(result):
                 curve, outcome = solution, Outcome.COARSE
-                coarse = curve.off_node_residuals() > self.off_node_tolerance
+                coarse = self.coarse(curve)
                 if not bool(coarse.any()):
                     return Refined(curve, Outcome.SOLVED, rounds)
             else:
-                outcome, coarse = Outcome.RESIDUAL, solution.off_node_residuals() > self.off_node_tolerance
+                outcome, coarse = Outcome.RESIDUAL, self.coarse(solution)
             middles = 0.5 * (solution.times[:-1] + solution.times[1:])
             times = torch.cat([solution.times, middles[coarse]]).sort().values
         return Refined(curve, outcome, rounds)
@@ -211,13 +220,17 @@ class Split(Segmentation):
                 curve, structure, outcome = solution, repaired, Outcome.RESIDUAL
                 segments = _spread(structure, solution.times, n_segments)
                 continue
+            if _collapsed(solution):
+                return Refined(solution, Outcome.STRUCTURE, rounds)
             curve, found = solution, find_structure(solution)
             if not found.same_arcs(structure):
+                if any(found.same_arcs(other) for other in tried):
+                    return Refined(curve, Outcome.STRUCTURE, rounds)  # going round in circles
                 tried.append(structure)
                 outcome, structure = Outcome.STRUCTURE, found
                 segments = _spread(found, solution.times, n_segments)
                 continue
-            coarse = solution.off_node_residuals() > self.off_node_tolerance
+            coarse = self.coarse(solution)
             if not bool(coarse.any()):
                 return Refined(curve, Outcome.SOLVED, rounds)
             outcome = Outcome.COARSE
@@ -231,6 +244,12 @@ class Split(Segmentation):
         share = torch.linspace(0, 1, n_segments + 1, dtype=curve.xi.dtype, device=curve.xi.device)
         collocation = Collocation.on_segments(disc, share * curve.times[-1], setting=curve.collocation.setting)
         return self.solve(collocation.with_setting(smoothing=smoothing), curve, callback)
+
+
+def _collapsed(curve: Curve, fraction: float = 1e-7) -> bool:
+    """Whether some arc was solved away to nothing: the wrong arcs, though the residual vanishes."""
+    durations = curve.times[1:] - curve.times[:-1]
+    return float(durations.min()) < fraction * float(curve.times[-1] - curve.times[0])
 
 
 @dataclass(frozen=True)

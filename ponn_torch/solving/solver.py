@@ -126,6 +126,8 @@ class _Run:
         self.discretisations: dict[Form, Discretisation] = {}
         self.stages: list[StageResult] = []
         self.start = 0
+        self.refused: list[Tensor] = []  # where smoothed solutions began whose refinement failed
+        self.note = ""
 
     # -- the line ------------------------------------------------------------------------------------------------------
 
@@ -168,7 +170,13 @@ class _Run:
         smoothed, message = self._continuation()
         if smoothed is None:
             return None, message
-        return self._refined(smoothed)
+        start = smoothed.curve.knots[0]
+        if any(float((start - other).abs().max()) < 1e-5 * float(start.abs().max()) for other in self.refused):
+            return None, f"start {self.start + 1} led to the same smoothed solution as one before: {self.note}"
+        refined, self.note = self._refined(smoothed)
+        if self.note:
+            self.refused.append(start)
+        return refined, self.note
 
     def _last_stage(self) -> Solution | None:
         solutions = [s.solution for s in self.stages if s.solution is not None]

@@ -20,7 +20,8 @@ from ponn_torch.optimal_control.control_laws import Regime
 from ponn_torch.optimal_control.curve import Curve
 from ponn_torch.optimal_control.discretisation import Discretisation, Form, Strong, Weak
 from ponn_torch.optimal_control.pontryagin import Chain, Setting, pontryagin
-from ponn_torch.optimal_control.problem import OptimalControlProblem, load_problem, nearest
+from ponn_torch.optimal_control.problem import OptimalControlProblem, nearest
+from ponn_torch.optimal_control.references import load_problem
 
 SOLUTION, WEIGHTS = "solution.json", "weights.npz"
 FORMAT = 1

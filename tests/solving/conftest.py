@@ -14,7 +14,7 @@ from ponn_torch.optimal_control.control_laws import Regime
 from ponn_torch.optimal_control.curve import Curve
 from ponn_torch.optimal_control.discretisation import Discretisation
 from ponn_torch.optimal_control.pontryagin import Setting, pontryagin
-from ponn_torch.optimal_control.problem import load_problem
+from ponn_torch.optimal_control.references import load_problem
 from ponn_torch.solving.guess import RandomGuess, project
 from ponn_torch.solving.solution import Solution
 

@@ -17,7 +17,8 @@ from analytic import minimum_energy, minimum_time, soft_end, solve, solve_minimu
 from ponn_torch.ansatz.basis import Chebyshev, GaussianRBF, Legendre, RandomFeatures
 from ponn_torch.optimal_control.control_laws import REGULARISERS, Regime, make_regulariser
 from ponn_torch.optimal_control.curve import Curve
-from ponn_torch.optimal_control.problem import ProblemOrigin, load_problem
+from ponn_torch.optimal_control.problem import ProblemOrigin
+from ponn_torch.optimal_control.references import load_problem
 from ponn_torch.solving.solution import Samples, Solution
 
 ANALYTIC = Path(__file__).with_name("analytic.py")
