@@ -1,0 +1,69 @@
+"""The README says what works: its Python is run, its commands are composed, its files exist."""
+
+import re
+import shlex
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from ponn_torch.build import build
+from ponn_torch.cli.overrides import groups, read
+
+ROOT = Path(__file__).parents[1]
+README = (ROOT / "README.md").read_text(encoding="utf-8")
+PYTHON = re.findall(r"^```python\n(.*?)^```", README, re.MULTILINE | re.DOTALL)
+SHELL = re.findall(r"^```sh\n(.*?)^```", README, re.MULTILINE | re.DOTALL)
+COMMANDS = [words for block in SHELL for line in block.splitlines() if (words := shlex.split(line, comments=True))]
+PONN = [words[1:] for words in COMMANDS if words[0] == "ponn"]
+
+
+def test_python_runs_from_top_to_bottom(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    names: dict[str, Any] = {}
+    first, problem, solve = PYTHON
+    exec(first, names)
+    assert names["result"].certified
+    assert names["again"].cost == pytest.approx(268.0146563274, abs=1e-6)
+    exec(problem, names)
+    exec(solve, names)
+    own = names["result"]
+    assert own.certified
+    assert own.solution.arcs == ["max", "min", "max"]
+    (stated,) = re.findall(r"max-min-max, ([\d.]+) kg", solve)
+    assert own.solution.cost == pytest.approx(float(stated), abs=5e-4)
+
+
+def test_a_sweep_and_a_single_run_are_shown() -> None:
+    assert any("-m" in arguments for arguments in PONN)
+    assert any("-m" not in arguments for arguments in PONN)
+
+
+@pytest.mark.parametrize("arguments", PONN, ids=" ".join)
+def test_commands_are_understood(arguments: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "lander.py").write_text(PYTHON[1], encoding="utf-8")
+    command = read(arguments)
+    assert command.multirun == ("-m" in arguments)
+    if command.config is not None:
+        build(command.config)
+
+
+def test_table_of_groups_is_complete() -> None:
+    rows = dict(re.findall(r"^\| `(\w+)` \| (.*)\|$", README, re.MULTILINE))
+    for name, options in groups().items():
+        if name == "hydra":
+            continue
+        for option in set(options) - {"custom"}:  # which a reference stands for
+            assert f"`{option}`" in rows[name], f"{name}={option} is missing from the README's table"
+
+
+@pytest.mark.parametrize("link", sorted(set(re.findall(r"\]\(([^)#:]+)\)|src=\"([^\"]+)\"", README))))
+def test_linked_files_exist(link: tuple[str, str]) -> None:
+    assert (ROOT / (link[0] or link[1])).is_file()
+
+
+def test_make_targets_exist() -> None:
+    makefile = (ROOT / "Makefile").read_text(encoding="utf-8")
+    for target in re.findall(r"(?:^|`)make ([a-z]+)\b", README, re.MULTILINE):
+        assert re.search(rf"^{target}:", makefile, re.MULTILINE), f"no make {target}"
