@@ -123,6 +123,7 @@ def solves(n_seeds: int) -> Report:
                 "starts": spread((r["starts"] for r in mine), ".0f"),
                 "iterations": spread((r["iterations"] for r in mine), ".0f"),
                 "residual evaluations": spread((r["residual_evaluations"] for r in mine), ".0f"),
+                "linearisations": spread((r["linearisations"] for r in mine), ".0f"),
                 "random start → solution, CPU s": spread((r["cpu_s"] for r in mine), ".2f"),
                 "certificate, CPU s": spread((r["certificate_s"] for r in mine), ".2f"),
                 "certificate / solution": spread((r["certificate_s"] / r["cpu_s"] for r in mine), ".1f"),

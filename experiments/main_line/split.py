@@ -76,6 +76,7 @@ def _summary(rows: Sequence[dict[str, Any]]) -> str:
                 "starts": over("starts", ".0f"),
                 "iterations": over("iterations", ".0f"),
                 "residual evaluations": over("residual_evaluations", ".0f"),
+                "linearisations": over("linearisations", ".0f"),
                 "CPU s to the solution": over("cpu_s", ".2f"),
                 "certificate, CPU s": over("certificate_s", ".2f"),
             }
