@@ -78,7 +78,8 @@ def write(folder: Path, name: str, report: Report) -> None:
     results.mkdir(exist_ok=True)
     for table, rows in report.tables.items():
         with (results / f"{table}.csv").open("w", newline="", encoding="utf-8") as stream:
-            writer = csv.DictWriter(stream, list(dict.fromkeys(k for row in rows for k in row)))
+            header = list(dict.fromkeys(key for row in rows for key in row))
+            writer = csv.DictWriter(stream, header, lineterminator="\n")
             writer.writeheader()
             writer.writerows({k: _cell(v) for k, v in row.items()} for row in rows)
     text = f"{report.summary}\n\n*{environment_line()}*\n"
