@@ -23,7 +23,7 @@ from ponn_torch.optimal_control.control_laws import Regime
 from ponn_torch.optimal_control.discretisation import Discretisation, Group
 from ponn_torch.optimal_control.linearisation import linearise
 from ponn_torch.optimal_control.pontryagin import BoundaryValueProblem, Setting
-from ponn_torch.optimal_control.problem import Named
+from ponn_torch.optimal_control.problem import Named, nearest
 
 
 @dataclass(frozen=True)
@@ -77,18 +77,25 @@ class Collocation:
         return cls(discretisation, knots, times, setting, events)
 
     def with_setting(self, *, smoothing: float | Tensor | None = None, **parameters: float | Tensor) -> Collocation:
-        """The same residual at another smoothing or other values of named parameters."""
+        """The same residual at another smoothing, fixed final time (s), or other values of named parameters.
+
+        Raises:
+            ValueError: a name that is no parameter, or the final time of a problem where it is unknown.
+        """
+        like, out = self.known_times, self
         regime, values = self.setting.regime, dict(self.setting.parameters)
         if smoothing is not None:
-            regime = replace(
-                regime,
-                smoothing=torch.as_tensor(smoothing, dtype=self.known_times.dtype).to(self.known_times),
-            )
-        for name, value in parameters.items():
-            if name not in values:
-                raise ValueError(f"no parameter named {name!r}; allowed: smoothing, {', '.join(values)}")
-            values[name] = torch.as_tensor(value, dtype=self.known_times.dtype).to(self.known_times)
-        return replace(self, setting=Setting(regime, values))
+            regime = replace(regime, smoothing=torch.as_tensor(smoothing, dtype=like.dtype, device=like.device))
+        for name, given in parameters.items():
+            value = torch.as_tensor(given, dtype=like.dtype, device=like.device)
+            if name in values:
+                values[name] = value
+            elif name == "final_time" and not self.bvp.problem.free_final_time:
+                stretch = value / self.bvp.time_unit / like[..., -1]
+                out = replace(out, known_times=like * stretch.unsqueeze(-1))
+            else:
+                raise ValueError(f"no parameter {name!r}; {nearest(name, ['smoothing', 'final_time', *values])}")
+        return replace(out, setting=Setting(regime, values))
 
     # -- layout ------------------------------------------------------------------------------------------------------
 

@@ -60,7 +60,7 @@ def earth_mars(
         description="Earth–Mars rendezvous, fixed time, minimum fuel",
         states={"r": 3, "v": 3, "m": 1},
         control=ThrustBall(
-            "thrust", maximum_thrust, minimum_thrust, make_regulariser(regulariser), switching_level, size=3
+            "thrust", "maximum_thrust", "minimum_thrust", make_regulariser(regulariser), switching_level, size=3
         ),
         dynamics=dynamics,
         running_cost=lambda t, x, u, p: alpha * u.thrust_magnitude,
@@ -81,6 +81,7 @@ def earth_mars(
             "time": TIME_UNIT,
             "cost": initial_mass,
         },
+        parameters={"maximum_thrust": maximum_thrust, "minimum_thrust": minimum_thrust},
         mass="m",
         cost_name="fuel",
         known_cost=known_cost,

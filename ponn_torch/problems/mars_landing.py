@@ -79,7 +79,7 @@ def mars_landing(
         description="Mars powered descent, minimum fuel",
         states={"r": 3, "v": 3, "m": 1},
         control=ThrustBall(
-            "thrust", maximum_thrust, minimum_thrust, make_regulariser(regulariser), switching_level, size=3
+            "thrust", "maximum_thrust", "minimum_thrust", make_regulariser(regulariser), switching_level, size=3
         ),
         dynamics=dynamics,
         running_cost=lambda t, x, u, p: alpha * u.thrust_magnitude,
@@ -89,6 +89,7 @@ def mars_landing(
         units={"r": length, "v": speed, "m": initial_mass, "time": final_time, "cost": initial_mass},
         # S = |λv|/(α m) + λm − 1 is O(1), so |λv| is of the order of α m, a sixtieth of cost/speed here
         costate_units={"r": alpha * initial_mass / final_time, "v": alpha * initial_mass, "m": 1.0},
+        parameters={"maximum_thrust": maximum_thrust, "minimum_thrust": minimum_thrust},
         mass="m",
         cost_name="fuel",
         known_cost=known_cost,
