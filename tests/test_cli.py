@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 
 from ponn_torch.cli import main
+from ponn_torch.cli.overrides import read
 from ponn_torch.solving.solution import Solution
 
 OWN_PROBLEM = """
@@ -270,3 +271,8 @@ def test_settings_can_be_listed(
     assert main(["--cfg", "job", "problem=tfc_test_1"]) == 0
     assert "mass_flow_per_thrust: 0.00050863" in capsys.readouterr().out
     assert list(tmp_path.iterdir()) == []
+
+
+def test_sweep_over_an_own_problem_is_understood(own_problem: Path) -> None:
+    command = read(["-m", f"problem={own_problem}:shift", "problem.arguments.time=1,2"])
+    assert command.multirun

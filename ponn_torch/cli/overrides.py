@@ -184,7 +184,7 @@ def _check_key(base: DictConfig, key: str, named: Sequence[str]) -> None:
         place.append(part)
         if not isinstance(node, DictConfig):
             return
-        if part not in node:
+        if part not in node.keys():  # noqa: SIM118 - 'in' does not see a value that is still missing
             allowed = [str(entry) for entry in node if str(entry) not in ("hydra", "_target_")]
             if len(place) == 1:
                 allowed += [name for name in named if name not in allowed and name != "hydra"]

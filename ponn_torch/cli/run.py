@@ -217,7 +217,9 @@ def _screen(outcome: Outcome, folder: Path, plan: Plan | None, keeper: _Keeper, 
         known = ""
         if outcome.known_cost is not None:
             excess = (outcome.cost - outcome.known_cost) / cost.size
-            known = f"; known optimum {outcome.known_cost / cost.size:.10g}, difference {excess:+.1e}"
+            smoothed = keeper.best is not None and keeper.best.smoothing is not None
+            what = "optimum without smoothing" if smoothed else "known optimum"
+            known = f"; {what} {outcome.known_cost / cost.size:.10g}, difference {excess:+.1e}"
         doubt = "" if outcome.certified else ", NOT certified"
         lines.append(f"{name:12}{outcome.cost / cost.size:.10g} {cost.label}{doubt}{known}")
         if outcome.final_time is not None:
