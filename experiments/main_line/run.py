@@ -1,4 +1,4 @@
-"""The issue's numbers from the command line: run parts, write tables, hold them against expected.json."""
+"""The numbers of the main line from the command line: run parts, write tables, hold them against expected.json."""
 
 from __future__ import annotations
 

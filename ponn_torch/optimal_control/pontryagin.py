@@ -110,6 +110,10 @@ class BoundaryValueProblem:
         y = torch.where(curved, self.exponent * torch.log(ratio), x / self.unit)
         return torch.cat([y, costates * self._psi(y)[1] / self.conjugate], -1)
 
+    def _parameters(self, setting: Setting) -> Named:
+        """The problem's parameters, those of the setting where it gives them."""
+        return Named(**{**self.problem.parameters, **setting.parameters})
+
     # -- the Hamiltonian and what follows from it ----------------------------------------------------------------
 
     def _hamiltonian(self, t: Tensor, x: Tensor, costates: Tensor, u: Any, p: Any) -> tuple[Tensor, Tensor]:
@@ -125,7 +129,7 @@ class BoundaryValueProblem:
     def minimiser(self, t: Tensor, w: Tensor, setting: Setting) -> Minimiser:
         """Control that minimises H at (t, w); t (..., 1) and w (..., 2n) scaled, control in the user's units."""
         x, costates = self.to_physical(w)
-        p, time = Named(**setting.parameters), t * self.time_unit
+        p, time = self._parameters(setting), t * self.time_unit
 
         def h(**u: Tensor) -> Tensor:
             return self._hamiltonian(time, x, costates, Named(**u), p)[0]
@@ -136,7 +140,7 @@ class BoundaryValueProblem:
         """F(t, w): scaled rates (..., 2n) of states and costates."""
         n = self.n_states
         u = Named(**self.minimiser(t, w, setting).control)
-        p, time, mu = Named(**setting.parameters), t * self.time_unit, w[..., n:]
+        p, time, mu = self._parameters(setting), t * self.time_unit, w[..., n:]
 
         def h(y: Tensor) -> tuple[Tensor, tuple[Tensor, Tensor]]:
             x, slope = self._psi(y)
@@ -153,7 +157,7 @@ class BoundaryValueProblem:
     def hamiltonian(self, t: Tensor, w: Tensor, setting: Setting) -> Tensor:
         """The Hamiltonian (..., 1) that the setting's law minimises, regulariser included, in cost_unit/time_unit."""
         x, costates = self.to_physical(w)
-        p, best = Named(**setting.parameters), self.minimiser(t, w, setting)
+        p, best = self._parameters(setting), self.minimiser(t, w, setting)
         # at the minimiser H is stationary in the control, so its derivative is that at fixed control; through a
         # saturated η it would be 0 · ∞
         best = Minimiser({k: v.detach() for k, v in best.control.items()}, best.switching, best.fraction.detach())
@@ -164,7 +168,7 @@ class BoundaryValueProblem:
 
     def running_cost(self, t: Tensor, w: Tensor, setting: Setting) -> Tensor:
         """The user's running cost (..., 1), without the regulariser, in cost_unit/time_unit."""
-        problem, p = self.problem, Named(**setting.parameters)
+        problem, p = self.problem, self._parameters(setting)
         if problem.running_cost is None:
             return torch.zeros_like(w[..., :1])
         u = Named(**self.minimiser(t, w, setting).control)
@@ -187,7 +191,7 @@ class BoundaryValueProblem:
 
     def terminal_rows(self, t: Tensor, w: Tensor, multipliers: Tensor, setting: Setting) -> Tensor:
         """Rows (..., n_terminal_rows) that vanish at the end: λ − φ_x − ψ_xᵀν, ψ, and H + φ_t + νᵀψ_t for free tf."""
-        problem, p = self.problem, Named(**setting.parameters)
+        problem, p = self.problem, self._parameters(setting)
         x, costates = self.to_physical(w)
         time, rows = t * self.time_unit, []
 

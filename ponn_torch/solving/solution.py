@@ -16,6 +16,7 @@ from torch import Tensor
 from ponn_torch.numerics.quadrature import integrate
 from ponn_torch.optimal_control.control_laws import INTERIOR, LOWER, UPPER
 from ponn_torch.optimal_control.curve import Curve
+from ponn_torch.optimal_control.discretisation import Weak
 from ponn_torch.optimal_control.pontryagin import BoundaryValueProblem, Setting, pontryagin
 from ponn_torch.optimal_control.problem import DisplayUnit, Named, OptimalControlProblem
 from ponn_torch.solving.storage import load_curve, save_curve
@@ -144,7 +145,14 @@ class Solution:
 
     @property
     def cost(self) -> float:
-        """∫ running cost dt + terminal cost, in the user's units and without the regulariser."""
+        """∫ running cost dt + terminal cost, in the user's units and without the regulariser.
+
+        A weak solution claims its moments, which the nodes' quadrature makes; between the nodes its control may jump to
+        and fro. Its cost is therefore that quadrature, and the certificate tells what flying it costs.
+        """
+        collocation = self.curve.collocation
+        if isinstance(collocation.discretisation.form, Weak):
+            return float(collocation.cost(self.curve.xi))
         bvp, times, total = self.bvp, self.curve.times, 0.0
         if self.problem.running_cost is not None:
 

@@ -259,7 +259,7 @@ def test_subdivisions_stay_at_their_fraction_between_switches():
 
 def test_an_unknown_parameter_is_named():
     made = collocation(pontryagin(ferry()))
-    with pytest.raises(ValueError, match="no parameter named 'thurst'; allowed: smoothing, thrust, tide"):
+    with pytest.raises(ValueError, match="no parameter 'thurst'; allowed: smoothing, final_time, thrust, tide"):
         made.with_setting(thurst=1.0)
 
 
