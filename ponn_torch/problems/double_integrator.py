@@ -17,10 +17,10 @@ def _dynamics(t: torch.Tensor, x: Named, u: Named, p: Named) -> dict[str, torch.
     return {"x": x.v, "v": u.force}
 
 
-def minimum_energy() -> OptimalControlProblem:
+def minimum_energy(*, name: str = "double_integrator_energy") -> OptimalControlProblem:
     """Minimise ½∫u² dt over one second: u = 6 − 12 t, cost 6."""
     return OptimalControlProblem(
-        name="double_integrator_energy",
+        name=name,
         states={"x": 1, "v": 1},
         control=Unconstrained("force", 1),
         dynamics=_dynamics,
@@ -32,10 +32,10 @@ def minimum_energy() -> OptimalControlProblem:
     )
 
 
-def minimum_time() -> OptimalControlProblem:
+def minimum_time(*, name: str = "double_integrator_time") -> OptimalControlProblem:
     """Minimise the time with |u| ≤ 1: full force, then full brake, 2 s with the switch at 1 s."""
     return OptimalControlProblem(
-        name="double_integrator_time",
+        name=name,
         states={"x": 1, "v": 1},
         control=Box("force", maximum=1.0, minimum=-1.0, size=1),
         dynamics=_dynamics,
@@ -47,7 +47,7 @@ def minimum_time() -> OptimalControlProblem:
     )
 
 
-def minimum_fuel(*, final_time: float = 3.0) -> OptimalControlProblem:
+def minimum_fuel(*, final_time: float = 3.0, name: str = "double_integrator_fuel") -> OptimalControlProblem:
     """Minimise ∫|u| dt in fixed time with |u| ≤ 1: push, coast, brake, each push of T/2 − √(T²/4 − 1) s."""
     if not final_time > 2.0:
         raise ValueError(f"final_time = {final_time} s; more than the minimum time of 2 s is needed")
@@ -56,7 +56,7 @@ def minimum_fuel(*, final_time: float = 3.0) -> OptimalControlProblem:
         return {"x": x.v, "v": u.force}
 
     return OptimalControlProblem(
-        name="double_integrator_fuel",
+        name=name,
         states={"x": 1, "v": 1},
         control=ThrustBall("force", maximum=1.0, size=1),
         dynamics=dynamics,

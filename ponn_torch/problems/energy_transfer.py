@@ -8,6 +8,7 @@ import torch
 
 from ponn_torch.optimal_control.control_laws import ThrustBall, Unconstrained
 from ponn_torch.optimal_control.problem import DisplayUnit, Named, OptimalControlProblem
+from ponn_torch.problems.arguments import check_positive
 from ponn_torch.problems.constants import ASTRONOMICAL_UNIT, DAY, KILOMETRE, STANDARD_GRAVITY, SUN_GM
 from ponn_torch.problems.earth_mars import FINAL_STATE_KM, INITIAL_STATE_KM, TIME_UNIT
 from ponn_torch.problems.known import known_optimum
@@ -38,17 +39,20 @@ def _sun_gravity(r: torch.Tensor) -> torch.Tensor:
     return -SUN_GM * r / torch.sqrt((r * r).sum(-1, keepdim=True)) ** 3
 
 
-def energy_transfer(*, final_time_days: float = 348.795, known_cost: float | None = None) -> OptimalControlProblem:
+def energy_transfer(
+    *, final_time_days: float = 348.795, known_cost: float | None = None, name: str = "energy_transfer"
+) -> OptimalControlProblem:
     """Minimise ½∫|a|² dt with free acceleration a and no mass; other extremals of it cost a hundred times more."""
     if known_cost is None:
         known_cost = known_optimum(energy_transfer, locals(), OPTIMA)
+    check_positive(final_time_days=final_time_days)
     initial, final = _ends()
 
     def dynamics(t: torch.Tensor, x: Named, u: Named, p: Named) -> dict[str, torch.Tensor]:
         return {"r": x.v, "v": _sun_gravity(x.r) + u.acceleration}
 
     return OptimalControlProblem(
-        name="energy_transfer",
+        name=name,
         description="Earth–Mars rendezvous, fixed time, minimum energy, unbounded acceleration",
         states={"r": 3, "v": 3},
         control=Unconstrained("acceleration", 3),
@@ -71,10 +75,17 @@ def energy_transfer_limited(
     maximum_thrust: float = 0.5,
     specific_impulse: float = 2000.0,
     known_cost: float | None = None,
+    name: str = "energy_transfer_limited",
 ) -> OptimalControlProblem:
     """Minimise ∫δ² dt with throttle δ = |T|/Tmax ≤ 1: the control saturates for a few days."""
     if known_cost is None:
         known_cost = known_optimum(energy_transfer_limited, locals(), LIMITED_OPTIMA)
+    check_positive(
+        initial_mass=initial_mass,
+        final_time_days=final_time_days,
+        maximum_thrust=maximum_thrust,
+        specific_impulse=specific_impulse,
+    )
     initial, final = _ends()
     alpha = 1.0 / (specific_impulse * STANDARD_GRAVITY)
 
@@ -82,7 +93,7 @@ def energy_transfer_limited(
         return {"r": x.v, "v": _sun_gravity(x.r) + u.thrust / x.m, "m": -alpha * u.thrust_magnitude}
 
     return OptimalControlProblem(
-        name="energy_transfer_limited",
+        name=name,
         description="Earth–Mars rendezvous, fixed time, minimum ∫δ² dt with limited thrust",
         states={"r": 3, "v": 3, "m": 1},
         control=ThrustBall("thrust", maximum_thrust, size=3),

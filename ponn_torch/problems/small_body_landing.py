@@ -9,6 +9,7 @@ import torch
 
 from ponn_torch.optimal_control.control_laws import ThrustBall, make_regulariser
 from ponn_torch.optimal_control.problem import DisplayUnit, Named, OptimalControlProblem, nearest
+from ponn_torch.problems.arguments import check_positive, check_thrust, check_vectors
 from ponn_torch.problems.constants import STANDARD_GRAVITY
 from ponn_torch.problems.known import known_optimum
 
@@ -33,6 +34,7 @@ def small_body_landing(
     regulariser: str = "entropy",
     switching_level: float = 0.0,
     known_cost: float | None = None,
+    name: str = "small_body_landing",
 ) -> OptimalControlProblem:
     """Soft landing in the frame that rotates with the body about +z, SI; an Eros-like body by default.
 
@@ -40,6 +42,19 @@ def small_body_landing(
     """
     if known_cost is None:
         known_cost = known_optimum(small_body_landing, locals(), OPTIMA_KG)
+    check_vectors(
+        initial_position=initial_position,
+        initial_velocity=initial_velocity,
+        final_position=final_position,
+        final_velocity=final_velocity,
+    )
+    check_positive(
+        initial_mass=initial_mass,
+        final_time=final_time,
+        specific_impulse=specific_impulse,
+        gravitational_parameter=gravitational_parameter,
+    )
+    check_thrust(minimum_thrust, maximum_thrust)
     if gravity_model not in GRAVITY_MODELS:
         raise ValueError(f"gravity_model = {gravity_model!r}; {nearest(gravity_model, GRAVITY_MODELS)}")
     alpha = 1.0 / (specific_impulse * STANDARD_GRAVITY)
@@ -68,7 +83,7 @@ def small_body_landing(
 
     length = math.dist(initial_position, final_position)
     return OptimalControlProblem(
-        name="small_body_landing",
+        name=name,
         description="Small-body landing in a rotating frame, minimum fuel",
         states={"r": 3, "v": 3, "m": 1},
         control=ThrustBall(
