@@ -114,7 +114,7 @@ class ArrowJacobian:
 
     def _gather(self, shared: Tensor) -> Tensor:
         """Shared unknowns (..., G) as the segments see them (..., K, S)."""
-        return torch.cat([shared, torch.zeros_like(shared[..., :1])], -1)[..., self.index]
+        return torch.cat([shared, shared.new_zeros(*shared.shape[:-1], 1)], -1)[..., self.index]
 
     def _scatter(self, segments: Tensor) -> Tensor:
         """Sum the segments' columns (..., K, S) into (..., G)."""

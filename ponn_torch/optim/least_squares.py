@@ -107,7 +107,8 @@ class LevenbergMarquardt:
         slow = torch.zeros_like(code)
         records: list[Record] = []
         n_residuals, n_linear = 0, 1
-        code = torch.where(cost.sqrt() < rule.tolerance, _code(Status.RESIDUAL), code)
+        if not rule.past_tolerance:
+            code = torch.where(cost.sqrt() < rule.tolerance, _code(Status.RESIDUAL), code)
         interrupted = False
         while bool((code == _RUNNING).any()):
             try:
@@ -154,7 +155,7 @@ class LevenbergMarquardt:
                     (slow >= rule.patience, Status.SMALL_DECREASE),
                     (accepted & (step_norm < rule.step), Status.SMALL_STEP),
                     (~torch.isfinite(scale).all(-1), Status.NON_FINITE),
-                    (damping > self.largest_damping, Status.DAMPING),
+                    (~accepted & (damping >= self.largest_damping), Status.DAMPING),
                     ((norm > rule.hopeless) & (iteration >= rule.hopeless_after), Status.HOPELESS),
                     (torch.tensor(iteration >= rule.max_iterations), Status.MAX_ITERATIONS),
                     (torch.tensor(watch.seconds > rule.cpu_seconds), Status.TIME_LIMIT),
@@ -218,7 +219,9 @@ class GaussNewton:
         _check_solver(self.linear_solver)
 
     def run(self, residual: Residual, xi: Tensor, on_iteration: Callback | None = None) -> OptimizeResult:
-        inner = LevenbergMarquardt(self.stopping, damping=0.0, linear_solver=self.linear_solver, smallest_damping=0.0)
+        inner = LevenbergMarquardt(
+            self.stopping, 0.0, linear_solver=self.linear_solver, smallest_damping=0.0, largest_damping=0.0
+        )
         return inner.run(residual, xi, on_iteration)
 
 

@@ -57,6 +57,13 @@ class Collocation:
     setting: Setting
     events: tuple[int | None, ...] = ()
 
+    def __post_init__(self) -> None:
+        if len(self.events) != self.n_segments - 1:
+            raise ValueError(
+                f"events = {self.events}: {len(self.events)} entries for {self.n_segments} segments; "
+                f"allowed: one per interior knot ({self.n_segments - 1})"
+            )
+
     @classmethod
     def on_segments(
         cls,
@@ -263,7 +270,8 @@ class Collocation:
         rate = bvp.running_cost(t.reshape(-1, 1), w.reshape(-1, w.shape[-1]), setting).view(t.shape[:-1])
         total = bvp.cost_unit * (h * (rate @ self.discretisation.nodes.weights)).sum(-1)
         if bvp.problem.terminal_cost is not None:
-            end = Named(**{k: v[..., None] for k, v in self.setting.parameters.items()})
+            given = {k: v[..., None] for k, v in self.setting.parameters.items()}
+            end = Named(**{**bvp.problem.parameters, **given})
             x = bvp.problem.named(bvp.to_physical(unknowns.knots[..., -1, :])[0])
             total = total + bvp.problem.terminal_cost(unknowns.times[..., -1:] * bvp.time_unit, x, end)[..., 0]
         return total

@@ -208,6 +208,13 @@ class Unconstrained:
             raise ValueError(
                 f"control {self.name!r}: the Hamiltonian is not quadratic in it, so ∂H/∂u = 0 has no closed form"
             )
+        try:
+            self.minimise(h, p, one, Regime())
+        except torch.linalg.LinAlgError:
+            raise ValueError(
+                f"control {self.name!r}: H_uu is singular, so ∂H/∂u = 0 does not determine it; "
+                "where H is linear in a control, it needs bounds (Box, ThrustBall)"
+            ) from None
         return self
 
     def minimise(self, h: Hamiltonian, p: Any, like: Tensor, regime: Regime) -> Minimiser:
@@ -323,7 +330,7 @@ class ThrustBall(Bounded):
 
 @dataclass(frozen=True)
 class Box(Bounded):
-    """Components with minimum ≤ u_i ≤ maximum, each entering H apart from the others, affine or convex."""
+    """Components with minimum ≤ u_i ≤ maximum, each entering H apart from the others, all affine or all convex."""
 
     size: int = 1
 
@@ -344,17 +351,23 @@ class Box(Bounded):
             raise ValueError(f"{self.name}: minimum = {self.minimum}, maximum = {self.maximum}; minimum < maximum")
         gradient = grad(lambda u: h(**{self.name: u}).sum())
         zero = torch.zeros_like(one).expand(*one.shape[:-1], self.size).contiguous()
-        base, change, scale = gradient(zero + low), 0.0, 0.0
+        base, changes, scale = gradient(zero + low), [], 0.0
         for i in range(self.size):
             step = zero.clone()
             step[..., i] = (high - low).flatten()[0]
             difference = gradient(zero + low + step) - base
             scale = max(scale, float(difference.abs().max()), 1e-12 * float(base.abs().max()))
-            change = max(change, float(difference[..., i].abs().max()))
+            changes.append(float(difference[..., i].abs().max()))
             difference[..., i] = 0.0
             if float(difference.abs().max()) > 1e-9 * scale:
                 raise ValueError(f"{self.name}: the Hamiltonian couples its components; a box needs a separable H")
-        curved = change > 1e-9 * float(base.abs().max())
+        convex = [change > 1e-9 * float(base.abs().max()) for change in changes]
+        curved = any(convex)
+        if curved and not all(convex):
+            raise ValueError(
+                f"{self.name}: the Hamiltonian is affine in component {convex.index(False)} and curved in component "
+                f"{convex.index(True)}; a box needs all of one kind"
+            )
         rate = self.cost_rate or unit / float((high - low).max())
         return replace(self, curved=curved, cost_rate=rate)
 

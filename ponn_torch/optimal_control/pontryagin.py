@@ -48,7 +48,7 @@ class BoundaryValueProblem:
     """State–costate equations ẇ = F(t, w) with what is known of w at both ends, scaled to O(1).
 
     Attributes:
-        linear (2n,): scaled unit of a state with a linear map, unused for exponential ones.
+        unit (n,): of every state. cost_unit, time_unit: of H times time, and of time.
         exponent (n,): 0 for x = unit·y; ±1 for x = unit·exp(±y).
         conjugate (n,): c = costate unit × state unit.
         known_initial, known_final: (2n,) scaled values, NaN where unknown.
@@ -84,7 +84,7 @@ class BoundaryValueProblem:
 
     def _psi(self, y: Tensor) -> tuple[Tensor, Tensor]:
         """ψ(y) and ψ'(y)."""
-        if not bool(self._has_exponential):
+        if self.mass_variable == "mass":
             return self.unit * y, self.unit.expand_as(y)
         curved = self.exponent != 0
         exponential = self.unit * torch.exp(torch.where(curved, self.exponent * y, torch.zeros_like(y)))
@@ -92,10 +92,6 @@ class BoundaryValueProblem:
             torch.where(curved, exponential, self.unit * y),
             torch.where(curved, self.exponent * exponential, self.unit.expand_as(y)),
         )
-
-    @property
-    def _has_exponential(self) -> bool:
-        return self.mass_variable != "mass"
 
     def to_physical(self, w: Tensor) -> tuple[Tensor, Tensor]:
         """States and costates in the user's units from w (..., 2n)."""
@@ -290,10 +286,8 @@ def _boundary(bvp: BoundaryValueProblem) -> dict[str, Any]:
                 w[bvp.n_states + i] = torch.nan
         out[f"known_{end}"] = w
     if problem.terminal_manifold is not None:
-        one, p = (
-            probe_points(bvp, 2)[0],
-            Named(**{k: torch.full((2, 1), v) for k, v in problem.parameters.items()}),
-        )
+        one = torch.ones_like(bvp.unit[:1]).expand(2, 1)
+        p = Named(**_parameters(bvp, one))
         psi = problem.terminal_manifold(one, problem.named(bvp.unit.expand(2, -1)), p)
         out["n_multipliers"] = psi.shape[-1]
     return out
@@ -312,12 +306,22 @@ def _parameters(bvp: BoundaryValueProblem, like: Tensor) -> dict[str, Tensor]:
 
 
 def probe_settings(bvp: BoundaryValueProblem, t: Tensor) -> list[Setting]:
-    """Settings under which the structure of F shows: smoothed, and off all bounds (a clipped law hides couplings)."""
-    parameters = _parameters(bvp, t)
-    interior = torch.full((*t.shape[:-1], bvp.law.n_switching), INTERIOR, device=t.device)
-    if bvp.law.curved:
-        interior = interior.chunk(2, -1)[0]
-    return [Setting(regime, parameters) for regime in (Regime(smoothing=0.3 + t), Regime(arcs=interior))]
+    """Settings under which the structure of F shows: smoothed, and on every arc; parameters vary from point to point.
+
+    What holds at one value of a parameter need not hold at the next. A saturated law hides how the control depends on
+    w: hence a smoothing that no S saturates, and the interior of a convex law.
+    """
+    generator = torch.Generator().manual_seed(2)
+    parameters = {}
+    for name, value in bvp.problem.parameters.items():
+        share = torch.rand(t.shape, generator=generator, dtype=torch.float64).to(t)
+        parameters[name] = value * (0.95 + 0.1 * share) if value else 1e-3 * share
+    regimes = [Regime(smoothing=0.3 + t), Regime(smoothing=1e6 * (0.3 + t))]
+    if bvp.law.n_switching:
+        n_bounded = bvp.law.n_switching // 2 if bvp.law.curved else bvp.law.n_switching
+        one = torch.ones(*t.shape[:-1], n_bounded, dtype=torch.long, device=t.device)
+        regimes += [Regime(arcs=code * one) for code in (LOWER, INTERIOR, UPPER)]
+    return [Setting(regime, parameters) for regime in regimes]
 
 
 def _adapted_law(bvp: BoundaryValueProblem) -> ControlSet:
@@ -339,15 +343,14 @@ def _single_chains(bvp: BoundaryValueProblem) -> tuple[Chain, ...]:
 
 
 def find_chains(bvp: BoundaryValueProblem, n_probes: int = 32) -> tuple[Chain, ...]:
-    """Find F_i ≡ k w_j by evaluating F at random points, join them, and mark chains whose last rate is zero."""
+    """Find F_i ≡ k w_j by evaluating F at random points, join them, and mark chains whose last rate is zero.
+
+    A chain has to hold in every setting: for all values of the parameters, and on every arc.
+    """
     t, w = probe_points(bvp, n_probes)
-    regimes = [Regime(smoothing=0.3 + t)]
-    if getattr(bvp.law, "curved", False):
-        # a convex H follows one equation inside the bounds and others on them; a chain has to hold on every arc
-        one = torch.ones(n_probes, bvp.law.n_switching // 2, dtype=torch.long, device=t.device)
-        regimes += [Regime(arcs=code * one) for code in (LOWER, INTERIOR, UPPER)]
-    rates = torch.cat([bvp.rates(t, w, Setting(regime, _parameters(bvp, t))) for regime in regimes])
-    w = w.repeat(len(regimes), 1)
+    settings = probe_settings(bvp, t)
+    rates = torch.cat([bvp.rates(t, w, setting) for setting in settings])
+    w = w.repeat(len(settings), 1)
     scale = rates.abs().amax().clamp_min(1.0)
     follows: dict[int, tuple[int, float]] = {}
     for i in range(bvp.dimension):

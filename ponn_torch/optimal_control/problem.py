@@ -118,7 +118,7 @@ class OptimalControlProblem:
         guess = self.final_time.guess if isinstance(self.final_time, FreeTime) else self.final_time
         if not (math.isfinite(guess) and guess > 0):
             raise ValueError(f"{self.name}: final_time = {guess} s; a positive number is needed")
-        if self.running_cost is None and self.terminal_cost is None and not self.free_final_time:
+        if self.running_cost is None and self.terminal_cost is None:
             raise ValueError(f"{self.name}: running_cost and terminal_cost are both missing; nothing to minimise")
         if self.mass is not None and self.mass not in self.states:
             raise ValueError(f"{self.name}: mass = {self.mass!r}; {nearest(self.mass, self.states)}")
@@ -210,7 +210,7 @@ class OptimalControlProblem:
         for name, size in self.states.items():
             if name not in rates:
                 raise ValueError(f"{self.name}: dynamics returns no rate for {name!r}")
-            shape = tuple(rates[name].shape)
+            shape = tuple(torch.as_tensor(rates[name]).shape)
             if shape[-1:] != (size,):
                 raise ValueError(f"{self.name}: dynamics[{name!r}] has shape {shape}; (..., {size}) is needed")
         for label, function, args in (

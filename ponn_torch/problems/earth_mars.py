@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import torch
 
 from ponn_torch.optimal_control.control_laws import ThrustBall, make_regulariser
-from ponn_torch.optimal_control.problem import DisplayUnit, Named, OptimalControlProblem
+from ponn_torch.optimal_control.problem import DisplayUnit, FreeTime, Named, OptimalControlProblem
 from ponn_torch.problems.arguments import check_positive, check_thrust, check_vectors
 from ponn_torch.problems.constants import ASTRONOMICAL_UNIT, DAY, KILOMETRE, STANDARD_GRAVITY, SUN_GM
 from ponn_torch.problems.known import known_optimum
@@ -94,4 +95,42 @@ def earth_mars(
             "thrust": DisplayUnit("N"),
             "origin": DisplayUnit("Sun"),
         },
+    )
+
+
+def earth_mars_minimum_time(
+    *,
+    initial_mass: float = 1000.0,
+    maximum_thrust: float = 0.5,
+    specific_impulse: float = 2000.0,
+    guess_days: float = 330.0,
+    known_cost: float | None = None,
+    name: str = "earth_mars_minimum_time",
+) -> OptimalControlProblem:
+    """The same rendezvous as fast as possible: no fixed time below this optimum is feasible (307.58 d at 0.5 N)."""
+    check_positive(
+        initial_mass=initial_mass,
+        maximum_thrust=maximum_thrust,
+        specific_impulse=specific_impulse,
+        guess_days=guess_days,
+    )
+    fuel_optimal = earth_mars(
+        initial_mass=initial_mass,
+        maximum_thrust=maximum_thrust,
+        specific_impulse=specific_impulse,
+        final_time_days=guess_days,
+    )
+    acceleration = maximum_thrust / initial_mass
+    return replace(
+        fuel_optimal,
+        name=name,
+        description="Earth–Mars rendezvous in minimum time",
+        running_cost=lambda t, x, u, p: torch.ones_like(x.m),
+        final_time=FreeTime(guess_days * DAY),
+        units={**fuel_optimal.units, "cost": TIME_UNIT},
+        # H = 1 − |λv| T/m + … vanishes, so |λv| is of the order of m/T
+        costate_units={"r": 1.0 / acceleration / TIME_UNIT, "v": 1.0 / acceleration, "m": TIME_UNIT / initial_mass},
+        cost_name="time",
+        known_cost=known_cost,
+        display={**fuel_optimal.display, "cost": DisplayUnit("d", DAY)},
     )

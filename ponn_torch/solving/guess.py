@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from ponn_torch.ansatz.basis import Chebyshev
+from ponn_torch.numerics.nodes import make_nodes
 from ponn_torch.optimal_control.collocation import Collocation, Unknowns
 from ponn_torch.optimal_control.curve import Curve
 from ponn_torch.optimal_control.discretisation import Discretisation, Strong
@@ -27,7 +28,6 @@ def project(collocation: Collocation, curve: ScaledCurve, times: Tensor | None =
     disc = collocation.discretisation
     times = collocation.known_times if times is None else times
     known = collocation.known_knots
-    # the knots of a discontinuous or extrapolated curve are read just inside the interval
     knots = torch.where(torch.isnan(known), curve(times), known)
     h = (times[1:] - times[:-1]) / 2
     t = times[:-1, None] + h[:, None] * (disc.nodes.points + 1.0)
@@ -86,8 +86,6 @@ class RandomGuess:
             raise ValueError(f"distribution = {self.distribution!r}; allowed: {', '.join(DISTRIBUTIONS)}")
 
     def curve(self, bvp: BoundaryValueProblem, seed: int) -> ScaledCurve:
-        from ponn_torch.numerics.nodes import make_nodes
-
         like = bvp.unit
         nodes = make_nodes("legendre_gauss", 2 * self.n_neurons, dtype=like.dtype, device=like.device)
         disc = Discretisation(bvp, Chebyshev(self.n_neurons), nodes, Strong(), "columns")
@@ -98,7 +96,8 @@ class RandomGuess:
         knots = self.scale * draw(like.new_empty(2, bvp.dimension), generator)
         if self.hold_mass and bvp.problem.mass is not None:
             mass = bvp.problem.slices[bvp.problem.mass].start
-            knots[:, mass] = bvp.known_initial[mass]
+            known_mass = bvp.known_initial[mass]
+            knots[:, mass] = torch.where(known_mass.isnan(), bvp.to_scaled(like, like)[mass], known_mass)
             knots[:, bvp.n_states + mass] = 1.0
             for group in disc.groups:
                 held = (group.columns[:, 0] == mass) | (group.columns[:, 0] == bvp.n_states + mass)

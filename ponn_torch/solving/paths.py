@@ -36,6 +36,11 @@ def _ends(bvp: BoundaryValueProblem, position: str, velocity: str) -> _Ends:
             raise ValueError(
                 f"guess needs a state {name!r} in problem {problem.name!r}; {nearest(name, problem.states)}"
             )
+    if problem.states[position] != problem.states[velocity]:
+        raise ValueError(
+            f"guess: state {position!r} has {problem.states[position]} components and {velocity!r} "
+            f"{problem.states[velocity]} in problem {problem.name!r}; allowed: the same number"
+        )
     first, last = problem.boundary("initial"), problem.boundary("final")
     filled = [
         [a if a is not None else b if b is not None else 0.0 for a, b in zip(one, other, strict=True)]
@@ -140,6 +145,11 @@ class PolarTransfer:
 
     def curve(self, bvp: BoundaryValueProblem, seed: int) -> ScaledCurve:
         ends = _ends(bvp, self.position, self.velocity)
+        if len(ends.position[0]) != 3:
+            raise ValueError(
+                f"guess: state {self.position!r} has {len(ends.position[0])} components in problem "
+                f"{bvp.problem.name!r}; a polar transfer needs 3"
+            )
         polar = [_polar(r, v) for r, v in zip(ends.position, ends.velocity, strict=True)]
         (values0, rates0), (values1, rates1) = polar
         turn = (

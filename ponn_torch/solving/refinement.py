@@ -112,25 +112,26 @@ class Segmentation:
         the whole, round-off alone in its second derivatives is above any tight tolerance.
         """
         share = (curve.times[1:] - curve.times[:-1]) / (curve.times[-1] - curve.times[0])
-        return curve.off_node_residuals() * share * self.n_segments > self.off_node_tolerance
+        fine = curve.off_node_residuals() * share * self.n_segments <= self.off_node_tolerance
+        return ~fine  # NaN is not fine
 
 
 @dataclass(frozen=True)
 class Subdivide(Segmentation):
     """Solve the curve's own regime on fixed segments, halved until the equations hold between the nodes.
 
-    A first round that fails is tried again with twice the segments.
+    A round that fails is tried again from the last curve that is solved, on more segments.
     """
 
     def run(self, start: Curve, callback: MakeCallback | None = None) -> Refined:
         bvp, setting = start.collocation.bvp, start.collocation.setting
         rounds: list[OptimizeResult] = []
         disc = self.discretisation(bvp)
-        ends = start.times[[0, -1]]
-        times = torch.linspace(0, 1, self.n_segments + 1, dtype=ends.dtype, device=ends.device) * ends[1]
+        share = torch.linspace(0, 1, self.n_segments + 1, dtype=start.xi.dtype, device=start.xi.device)
+        times = share * start.times[-1]
         curve, outcome = start, Outcome.COARSE
         for _ in range(self.max_rounds):
-            if len(times) > self.max_segments:
+            if len(times) - 1 > self.max_segments:
                 return Refined(curve, Outcome.TOO_MANY_SEGMENTS, rounds)
             solution, result = self.solve(Collocation.on_segments(disc, times, setting=setting), curve, callback)
             rounds.append(result)
@@ -143,6 +144,7 @@ class Subdivide(Segmentation):
                     return Refined(curve, Outcome.SOLVED, rounds)
             else:
                 outcome, coarse = Outcome.RESIDUAL, self.coarse(solution)
+                coarse = coarse if bool(coarse.any()) else ~coarse  # the same round again would fail again
             middles = 0.5 * (solution.times[:-1] + solution.times[1:])
             times = torch.cat([solution.times, middles[coarse]]).sort().values
         return Refined(curve, outcome, rounds)
@@ -260,10 +262,9 @@ class Segments:
     events: tuple[int | None, ...]
     arcs: Tensor
 
-    def halved(self, which: Tensor | None = None) -> Segments:
-        """Cut the chosen segments (K,) in two; all of them if None."""
-        k = len(self.arcs)
-        chosen = [True] * k if which is None else which.tolist()
+    def halved(self, which: Tensor) -> Segments:
+        """Cut the chosen segments, booleans (K,), in two."""
+        k, chosen = len(self.arcs), which.tolist()
         times, codes = [self.times[0]], []
         events: list[int | None] = []
         for i in range(k):

@@ -218,7 +218,7 @@ class _Run:
                 result = self._optimise("smooth", trial, xi, solver.optimizer)
             except NonFiniteResidual as error:
                 message = str(error)
-                return Outcome.ABORT
+                return Outcome.ABORT if first else Outcome.FAILED
             solution = self._record("smooth", Curve(trial, result.xi), result)
             failed = not float(result.norm) < solver.start_limit
             if first and failed:
@@ -227,6 +227,8 @@ class _Run:
                     f"after the first stage ({result.status.value})"
                 )
                 return Outcome.ABORT
+            if failed:
+                return Outcome.FAILED
             first = False
             change = float((result.xi - xi).abs().max())
             current, xi = trial, result.xi
@@ -244,8 +246,9 @@ class _Run:
         """Whether the stage's equations hold between the nodes too (a weak form claims its moments only)."""
         if not isinstance(solution.curve.collocation.discretisation.form, Strong):
             return True
-        _, _, rates = solution.curve.on_segment(solution.curve.collocation.discretisation.nodes.points, 0)
-        return solution.off_node_residual <= self.solver.trust * float(rates.abs().max())
+        curve, points = solution.curve, solution.curve.collocation.discretisation.nodes.points
+        largest = max(float(curve.on_segment(points, k)[2].abs().max()) for k in range(curve.collocation.n_segments))
+        return solution.off_node_residual <= self.solver.trust * largest
 
     # -- refinement ---------------------------------------------------------------------------------------------------
 

@@ -61,6 +61,14 @@ def earth_mars(x, c) -> Rates:
     return spacecraft(x, c, *fuel_thrust(x, c, alpha, 0.0, 0.5), alpha, *central(SUN, x.r, c.v))
 
 
+def earth_mars_minimum_time(x, c) -> Rates:
+    alpha, most = 1 / (ISP * G0), 0.5
+    # S = −(∂H/∂|T|)/s with s the unit of H, here 1, per largest thrust
+    switching = most * (norm(c.v) / x.m + alpha * c.m)
+    size = most * 0.5 * (1 + torch.tanh(switching / RHO))
+    return spacecraft(x, c, size, -size * c.v / norm(c.v), alpha, *central(SUN, x.r, c.v))
+
+
 def energy_transfer(x, c) -> Rates:
     gravity, lambda_r = central(SUN, x.r, c.v)
     return {"r": x.v, "v": gravity - c.v, "lambda_r": lambda_r, "lambda_v": -c.r}
@@ -118,6 +126,7 @@ BY_HAND: dict[str, Callable[..., Rates]] = {
         lambda costate: -torch.sign(costate) * 0.5 * (1 + torch.tanh((costate.abs() - 1) / RHO))
     ),
     "earth_mars": earth_mars,
+    "earth_mars_minimum_time": earth_mars_minimum_time,
     "energy_transfer": energy_transfer,
     "energy_transfer_limited": energy_transfer_limited,
     "mars_landing": landing(CANTED),
