@@ -210,7 +210,7 @@ class Unconstrained:
             )
         try:
             self.minimise(h, p, one, Regime())
-        except torch.linalg.LinAlgError:
+        except torch.linalg.LinAlgError:  # type: ignore[attr-defined]
             raise ValueError(
                 f"control {self.name!r}: H_uu is singular, so ∂H/∂u = 0 does not determine it; "
                 "where H is linear in a control, it needs bounds (Box, ThrustBall)"

@@ -476,3 +476,30 @@ def test_records_survive_single_precision():
     assert result.xi.dtype is torch.float32
     assert result.status is Status.RESIDUAL
     assert np.allclose(result.xi.numpy(), [3.0, -2.0], atol=1e-4)
+
+
+class _ArcTangent:
+    """r = atan ξ: the full Gauss–Newton step overshoots from |ξ| > 1.39."""
+
+    n_unknowns = 1
+
+    def residual(self, xi):
+        return torch.atan(xi)
+
+    def linearise(self, xi):
+        return self.residual(xi), DenseJacobian((1 / (1 + xi**2)).unsqueeze(-1))
+
+    def blocks(self, residual):
+        return {"only": residual.norm(dim=-1)}
+
+
+def test_gauss_newton_ends_at_the_first_step_that_raises_the_norm():
+    result = GaussNewton().run(_ArcTangent(), torch.tensor([3.0], dtype=torch.float64))
+    assert (result.status, result.n_iterations) == (Status.DAMPING, 1)
+
+
+def test_past_tolerance_holds_for_a_start_below_the_tolerance_too():
+    start = torch.tensor([1e-4], dtype=torch.float64)
+    stopping = Stopping(tolerance=1e-3, past_tolerance=True)
+    assert float(LevenbergMarquardt(stopping).run(_ArcTangent(), start).norm) < 1e-8
+    assert LevenbergMarquardt(Stopping(tolerance=1e-3)).run(_ArcTangent(), start).n_iterations == 0

@@ -243,3 +243,10 @@ def test_a_backward_orbit_turns_backward():
 def test_errors_name_field_value_and_what_is_allowed(make, message):
     with pytest.raises(ValueError, match=message):
         make()
+
+
+def test_a_random_guess_of_a_free_initial_mass_is_finite():
+    landing = problem("mars_landing")
+    free = landing.with_boundary(initial={k: v for k, v in landing.initial.items() if k != landing.mass})
+    times = torch.linspace(0.0, 1.0, 5, dtype=torch.float64)
+    assert bool(torch.isfinite(RandomGuess().curve(pontryagin(free), 0)(times)).all())
