@@ -106,7 +106,7 @@ class LevenbergMarquardt:
         code = torch.full(cost.shape, _RUNNING, dtype=torch.long, device=cost.device)
         slow = torch.zeros_like(code)
         records: list[Record] = []
-        n_residuals, n_linear = 0, 1
+        n_residuals, n_linear, tiny = 0, 1, torch.finfo(cost.dtype).tiny
         if not rule.past_tolerance:
             code = torch.where(cost.sqrt() < rule.tolerance, _code(Status.RESIDUAL), code)
         interrupted = False
@@ -121,11 +121,11 @@ class LevenbergMarquardt:
                 accepted = running & (trial_cost < cost)  # NaN compares false: a non-finite step is rejected
                 # ‖r‖² − ‖r + J p‖² for the exact solution of the damped system
                 predicted = (step * (damping.unsqueeze(-1) * scale.square() * step - jacobian.gradient(r))).sum(-1)
-                gain = (cost - trial_cost) / predicted.clamp_min(torch.finfo(cost.dtype).tiny)
+                gain = (cost - trial_cost) / predicted.clamp_min(tiny)
                 damping, growth = self._update(damping, growth, gain, accepted, running)
                 # a rejected step that promised next to nothing is as good as a small decrease: round-off is near
                 relative = torch.where(accepted, cost - trial_cost, predicted) / cost
-                step_norm = (scale * step).norm(dim=-1) / (scale * xi).norm(dim=-1).clamp_min(1e-300)
+                step_norm = (scale * step).norm(dim=-1) / (scale * xi).norm(dim=-1).clamp_min(tiny)
                 rises = running & ~accepted & (cost.sqrt() < rule.tolerance)
                 if bool(accepted.any()):
                     xi = torch.where(accepted.unsqueeze(-1), trial, xi)

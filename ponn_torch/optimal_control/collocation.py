@@ -98,6 +98,8 @@ class Collocation:
             if name in values:
                 values[name] = value
             elif name == "final_time" and not self.bvp.problem.free_final_time:
+                if not bool((value > 0).all()):
+                    raise ValueError(f"final_time = {given} s; allowed: a positive number")
                 stretch = value / self.bvp.time_unit / like[..., -1]
                 out = replace(out, known_times=like * stretch.unsqueeze(-1))
             else:

@@ -240,8 +240,9 @@ def pontryagin(
     if mass_variable != "mass" and problem.mass is None:
         raise ValueError(f"mass_variable = {mass_variable!r}, but problem {problem.name!r} names no mass")
 
+    # what is derived by probing needs float64, whatever the solver's precision
     def tensor(values: list[float]) -> Tensor:
-        return torch.tensor(values, dtype=dtype, device=device)
+        return torch.tensor(values, dtype=torch.float64)
 
     sizes = problem.states.items()
     unit = [problem.unit(name) for name, size in sizes for _ in range(size)]
@@ -263,7 +264,9 @@ def pontryagin(
         known_final=tensor([]),
     )
     bvp = replace(bvp, **_boundary(bvp), law=_adapted_law(bvp))
-    return replace(bvp, chains=find_chains(bvp) if chains else _single_chains(bvp))
+    bvp = replace(bvp, chains=find_chains(bvp) if chains else _single_chains(bvp))
+    tensors = ("unit", "exponent", "conjugate", "known_initial", "known_final")
+    return replace(bvp, **{name: getattr(bvp, name).to(dtype=dtype, device=device) for name in tensors})
 
 
 def _boundary(bvp: BoundaryValueProblem) -> dict[str, Any]:

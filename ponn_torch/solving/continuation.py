@@ -81,7 +81,7 @@ class Adaptive:
     parameter: str = "smoothing"
 
     def __post_init__(self) -> None:
-        _check_values(self.parameter, (self.first, self.last))
+        _check_values(self.parameter, (self.first, self.last), positive=True)
         if not 0 < self.factor < 1:
             raise ValueError(f"factor = {self.factor}; allowed: between 0 and 1")
 
@@ -136,9 +136,12 @@ class Single:
         attempt(self.smoothing, "smoothing", self.form)
 
 
-def _check_values(parameter: str, values: Sequence[float]) -> None:
+def _check_values(parameter: str, values: Sequence[float], positive: bool = False) -> None:
+    """Finite values; positive ones for what is divided by or taken the logarithm of."""
+    positive = positive or parameter in ("smoothing", "final_time")
     if not values:
         raise ValueError(f"continuation values of {parameter!r}: none given; allowed: at least one")
     for value in values:
-        if not (math.isfinite(value) and value > 0):
-            raise ValueError(f"continuation values of {parameter!r}: {value}; allowed: positive numbers")
+        if not math.isfinite(value) or (positive and not value > 0):
+            allowed = "positive numbers" if positive else "finite numbers"
+            raise ValueError(f"continuation values of {parameter!r}: {value}; allowed: {allowed}")

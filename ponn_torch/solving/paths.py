@@ -51,6 +51,12 @@ def _ends(bvp: BoundaryValueProblem, position: str, velocity: str) -> _Ends:
     return _Ends((start[r], end[r]), (start[v], end[v]))
 
 
+def _unit(vector: Tensor, guess: str, name: str) -> Tensor:
+    if not float(vector.norm()):
+        raise ValueError(f"the {guess} guess needs a direction, but {name} is zero; take a random guess")
+    return vector / vector.norm()
+
+
 def _interpolated(bvp: BoundaryValueProblem, z: Tensor, w: Tensor) -> ScaledCurve:
     """The polynomial through samples w (n, 2n) at z (n,), as a function of scaled time."""
     return lambda t: interpolation_matrix(z, (2 * t / bvp.final_time - 1).clamp(-1.0, 1.0)) @ w
@@ -97,7 +103,9 @@ class StraightLine:
     def curve(self, bvp: BoundaryValueProblem, seed: int) -> ScaledCurve:
         ends = _ends(bvp, self.position, self.velocity)
         (r0, rf), change = ends.position, ends.velocity[1] - ends.velocity[0]
-        direction = -change / change.norm().clamp_min(1e-300)
+        # from rest to rest there is no change of velocity: thrust first towards the end
+        change = change if float(change.norm()) else rf - r0
+        direction = -_unit(change, "straight line", self.position)
         return _curve_from_path(
             bvp,
             lambda s: r0 + s[:, None] * (rf - r0),
@@ -117,7 +125,8 @@ class PoweredDescent:
     def curve(self, bvp: BoundaryValueProblem, seed: int) -> ScaledCurve:
         ends = _ends(bvp, self.position, self.velocity)
         r0, rf = ends.position
-        start, end = ends.velocity[0] / ends.velocity[0].norm(), -r0 / r0.norm()
+        start = _unit(ends.velocity[0], "powered descent", f"initial {self.velocity}")
+        end = -_unit(r0, "powered descent", f"initial {self.position}")
         return _curve_from_path(
             bvp,
             lambda s: r0 + s[:, None] * (rf - r0),

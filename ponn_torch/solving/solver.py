@@ -134,7 +134,7 @@ class _Run:
     def result(self) -> SolveResult:
         best: tuple[Solution, Certificate] | None = None
         message, interrupted, n_certified = "", False, 0
-        seconds = 0.0  # certificates apart
+        seconds, watch = 0.0, Stopwatch()  # certificates apart
         try:
             for start in range(self.solver.n_starts):
                 self.start = start
@@ -152,7 +152,7 @@ class _Run:
                 enough = 1 if self.solver.refinement is None else n_certified
                 if enough >= self.solver.n_certified:
                     break
-        except _Interrupted:
+        except (_Interrupted, KeyboardInterrupt):
             interrupted, message = True, "interrupted; the best stage so far is kept"
             seconds += watch.seconds
         solution = best[0] if best else self._last_stage()

@@ -145,8 +145,9 @@ def test_giving_up_ends_all_phases_and_unchanged_only_its_own():
     [
         (lambda: Ladder(()), "continuation values of 'smoothing': none given; allowed: at least one"),
         (lambda: Ladder((1.0, 0.0)), "continuation values of 'smoothing': 0.0; allowed: positive numbers"),
-        (lambda: Ladder((1.0, -2.0), parameter="thrust"), "values of 'thrust': -2.0; allowed: positive"),
+        (lambda: Ladder((1.0, math.nan), parameter="thrust"), "values of 'thrust': nan; allowed: finite"),
         (lambda: Ladder((math.nan,)), "nan; allowed: positive"),
+        (lambda: Ladder((-2.0,), parameter="final_time"), "values of 'final_time': -2.0; allowed: positive"),
         (lambda: log_ladder(0.0), "0.0; allowed: positive"),
         (lambda: log_ladder(count=1), "count = 1; allowed: at least 2"),
         (lambda: Adaptive(factor=1.0), "factor = 1.0; allowed: between 0 and 1"),
