@@ -8,9 +8,9 @@ from collections.abc import Sequence
 import torch
 
 from ponn_torch.optimal_control.control_laws import ThrustBall, make_regulariser
-from ponn_torch.optimal_control.problem import DisplayUnit, FreeTime, Named, OptimalControlProblem
+from ponn_torch.optimal_control.problem import FreeTime, Named, OptimalControlProblem
 from ponn_torch.problems.arguments import check_positive, check_thrust, check_vectors
-from ponn_torch.problems.constants import STANDARD_GRAVITY
+from ponn_torch.problems.constants import LANDING_DISPLAY, STANDARD_GRAVITY
 from ponn_torch.problems.known import known_optimum
 
 _TFC: dict[str, object] = {"mass_flow_per_thrust": 5.0863e-4, "free_final_time": True}
@@ -93,12 +93,5 @@ def mars_landing(
         mass="m",
         cost_name="fuel",
         known_cost=known_cost,
-        display={
-            "time": DisplayUnit("s"),
-            "r": DisplayUnit("m"),
-            "v": DisplayUnit("m/s"),
-            "m": DisplayUnit("kg"),
-            "cost": DisplayUnit("kg"),
-            "thrust": DisplayUnit("N"),
-        },
+        display=LANDING_DISPLAY,
     )
