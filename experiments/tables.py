@@ -7,7 +7,7 @@ import json
 import math
 import re
 import statistics
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -98,6 +98,18 @@ def _paste(readme: Path, name: str, text: str) -> None:
     if not pattern.search(old):
         raise ValueError(f"{readme.name} has no place for {name!r}: <!-- {name} --> … <!-- /{name} -->")
     readme.write_text(pattern.sub(lambda found: f"{found[1]}{text}{found[2]}", old), encoding="utf-8")
+
+
+def run_study(folder: Path, parts: Mapping[str, Callable[[], Report]], *, check_only: bool) -> int:
+    """Run the parts in turn, print and write what they find, hold it against expected.json; the exit code."""
+    measured: dict[str, float] = {}
+    for name, part in parts.items():
+        report = part()
+        print(f"\n{report.summary}\n", flush=True)
+        measured |= report.measured
+        if not check_only:
+            write(folder, name, report)
+    return 0 if check(folder, list(parts), measured) else 1
 
 
 # -- checks --------------------------------------------------------------------------------------------------

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import argparse
 import sys
+from functools import partial
 from pathlib import Path
 
 import torch
 
 from experiments.main_line import smoothed, split, starts, unsplit
-from experiments.tables import check, write
+from experiments.tables import run_study
 
 FOLDER = Path(__file__).parent
 PARTS = {
@@ -30,14 +31,8 @@ def main() -> int:
     if arguments.seeds < 1:
         parser.error(f"--seeds {arguments.seeds}; allowed: at least 1")
     torch.set_num_threads(1)
-    measured: dict[str, float] = {}
-    for part in arguments.parts:
-        report = PARTS[part](range(arguments.seeds))
-        print(f"\n{report.summary}\n", flush=True)
-        measured |= report.measured
-        if not arguments.check_only:
-            write(FOLDER, part, report)
-    return 0 if check(FOLDER, arguments.parts, measured) else 1
+    parts = {name: partial(PARTS[name], range(arguments.seeds)) for name in arguments.parts}
+    return run_study(FOLDER, parts, check_only=arguments.check_only)
 
 
 if __name__ == "__main__":

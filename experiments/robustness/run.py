@@ -6,6 +6,7 @@ import argparse
 import sys
 from collections import Counter
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,7 @@ import numpy as np
 import torch
 
 from experiments.solves import row
-from experiments.tables import Report, check, markdown, share, spread, write
+from experiments.tables import Report, markdown, run_study, share, spread
 from ponn_torch.optimal_control.problem import OptimalControlProblem
 from ponn_torch.problems.constants import DAY
 from ponn_torch.problems.earth_mars import earth_mars, earth_mars_minimum_time
@@ -109,15 +110,9 @@ def main() -> int:
     parser.add_argument("--check-only", action="store_true", help="do not write results")
     arguments = parser.parse_args()
     torch.set_num_threads(1)
-    measured: dict[str, float] = {}
-    for part in arguments.parts:
-        run, count = PARTS[part]
-        report = run(arguments.count or count)
-        print(f"\n{report.summary}\n", flush=True)
-        measured |= report.measured
-        if not arguments.check_only:
-            write(FOLDER, part, report)
-    return 0 if check(FOLDER, arguments.parts, measured) else 1
+    chosen = {name: PARTS[name] for name in arguments.parts}
+    parts = {name: partial(run, arguments.count or count) for name, (run, count) in chosen.items()}
+    return run_study(FOLDER, parts, check_only=arguments.check_only)
 
 
 if __name__ == "__main__":

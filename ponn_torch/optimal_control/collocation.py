@@ -23,7 +23,7 @@ from ponn_torch.optimal_control.control_laws import Regime
 from ponn_torch.optimal_control.discretisation import Discretisation, Group
 from ponn_torch.optimal_control.linearisation import linearise
 from ponn_torch.optimal_control.pontryagin import BoundaryValueProblem, Setting
-from ponn_torch.optimal_control.problem import Named, nearest
+from ponn_torch.optimal_control.problem import nearest
 
 
 @dataclass(frozen=True)
@@ -271,12 +271,9 @@ class Collocation:
         setting = self.point_setting(t.shape[:-1])
         rate = bvp.running_cost(t.reshape(-1, 1), w.reshape(-1, w.shape[-1]), setting).view(t.shape[:-1])
         total = bvp.cost_unit * (h * (rate @ self.discretisation.nodes.weights)).sum(-1)
-        if bvp.problem.terminal_cost is not None:
-            given = {k: v[..., None] for k, v in self.setting.parameters.items()}
-            end = Named(**{**bvp.problem.parameters, **given})
-            x = bvp.problem.named(bvp.to_physical(unknowns.knots[..., -1, :])[0])
-            total = total + bvp.problem.terminal_cost(unknowns.times[..., -1:] * bvp.time_unit, x, end)[..., 0]
-        return total
+        end = Setting(parameters={k: v[..., None] for k, v in self.setting.parameters.items()})
+        x = bvp.to_physical(unknowns.knots[..., -1, :])[0]
+        return total + bvp.terminal_cost(unknowns.times[..., -1:], x, end)[..., 0]
 
     def linearise(self, xi: Tensor) -> tuple[Tensor, ArrowJacobian]:
         """(r, J), exact; see linearisation.py."""

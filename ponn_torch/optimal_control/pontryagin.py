@@ -171,6 +171,13 @@ class BoundaryValueProblem:
         state = problem.named(self.to_physical(w)[0])
         return problem.running_cost(t * self.time_unit, state, u, p) * (self.time_unit / self.cost_unit)
 
+    def terminal_cost(self, t: Tensor, x: Tensor, setting: Setting) -> Tensor:
+        """The user's terminal cost (..., 1) at scaled times t (..., 1) and states x (..., n) in the user's units."""
+        problem = self.problem
+        if problem.terminal_cost is None:
+            return torch.zeros_like(t)
+        return problem.terminal_cost(t * self.time_unit, problem.named(x), self._parameters(setting))
+
     # -- the end of the trajectory --------------------------------------------------------------------------------
 
     @property

@@ -12,7 +12,6 @@ from torch.func import grad
 
 from ponn_torch.optimal_control.control_laws import INTERIOR, UPPER, Regime
 from ponn_torch.optimal_control.pontryagin import Setting
-from ponn_torch.optimal_control.problem import Named
 from ponn_torch.solving.flight import Flight, arc_knots
 from ponn_torch.solving.solution import Solution
 
@@ -98,13 +97,9 @@ def terminal(solution: Solution, flight: Flight) -> tuple[float, float, float | 
 
 def flown_cost(solution: Solution, flight: Flight) -> float:
     """Cost of the control flown alone, user units; NaN if it did not arrive."""
-    bvp, problem = solution.reference, solution.problem
+    bvp = solution.reference
     t, y, setting = _last(solution, flight)
-    cost = bvp.cost_unit * float(y[0, -1])
-    if problem.terminal_cost is not None:
-        state = problem.named(bvp.unit * y[:, : bvp.n_states])
-        cost += float(problem.terminal_cost(t * bvp.time_unit, state, Named(**setting.parameters)))
-    return cost
+    return bvp.cost_unit * float(y[0, -1]) + float(bvp.terminal_cost(t, bvp.unit * y[:, : bvp.n_states], setting))
 
 
 def _time_slope(solution: Solution, t: Tensor, w: Tensor, setting: Setting) -> Tensor:

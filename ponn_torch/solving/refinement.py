@@ -13,7 +13,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from enum import Enum
-from typing import Protocol
+from typing import ClassVar, Protocol
 
 import torch
 from torch import Tensor
@@ -55,6 +55,8 @@ class Refined:
 
 
 class Refinement(Protocol):
+    reads_arcs: ClassVar[bool]  # whether the arcs of the curve it starts from matter
+
     def run(self, start: Curve, callback: MakeCallback | None = None) -> Refined:
         """Refine a curve; never raises for want of convergence, the outcome says how it ended."""
         ...
@@ -123,6 +125,8 @@ class Subdivide(Segmentation):
     A round that fails is tried again from the last curve that is solved, on more segments.
     """
 
+    reads_arcs: ClassVar[bool] = False
+
     def run(self, start: Curve, callback: MakeCallback | None = None) -> Refined:
         bvp, setting = start.collocation.bvp, start.collocation.setting
         rounds: list[OptimizeResult] = []
@@ -164,6 +168,7 @@ class Split(Segmentation):
         max_sharpenings, sharpening: how often, and by which factor, the smoothing is lowered after a failure.
     """
 
+    reads_arcs: ClassVar[bool] = True
     max_arcs: int = 40
     short_arc: float = 1e-4
     max_sharpenings: int = 4

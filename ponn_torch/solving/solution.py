@@ -18,7 +18,7 @@ from ponn_torch.optimal_control.control_laws import INTERIOR, LOWER, UPPER
 from ponn_torch.optimal_control.curve import Curve
 from ponn_torch.optimal_control.discretisation import Weak
 from ponn_torch.optimal_control.pontryagin import BoundaryValueProblem, Setting, pontryagin
-from ponn_torch.optimal_control.problem import DisplayUnit, Named, OptimalControlProblem
+from ponn_torch.optimal_control.problem import DisplayUnit, OptimalControlProblem
 from ponn_torch.solving.storage import load_curve, save_curve
 
 ARC_LABELS = {LOWER: "min", INTERIOR: "interior", UPPER: "max"}
@@ -168,15 +168,9 @@ class Solution:
 
     @property
     def _terminal_cost(self) -> float:
-        problem = self.problem
-        if problem.terminal_cost is None:
-            return 0.0
-        x, _ = self.bvp.to_physical(self.curve.knots[-1])
-        parameters = self.curve.setting(
-            torch.tensor([self.curve.collocation.n_segments - 1], device=x.device)
-        ).parameters
-        p = Named(**{name: value[0] for name, value in parameters.items()})
-        return float(problem.terminal_cost(x.new_tensor([self.final_time]), problem.named(x), p))
+        x, _ = self.bvp.to_physical(self.curve.knots[-1:])
+        last = torch.tensor([self.curve.collocation.n_segments - 1], device=x.device)
+        return float(self.bvp.terminal_cost(self.curve.times[-1:, None], x, self.curve.setting(last)))
 
     # -- sampling --------------------------------------------------------------------------------------------
 

@@ -35,7 +35,7 @@ from ponn_torch.solving.certificate import Certificate, Tolerances, certify
 from ponn_torch.solving.continuation import Ladder, Outcome, Schedule
 from ponn_torch.solving.guess import Guess, RandomGuess, project
 from ponn_torch.solving.observer import Observer, SilentObserver, StageResult
-from ponn_torch.solving.refinement import Refinement, Split, Subdivide
+from ponn_torch.solving.refinement import Refinement, Split
 from ponn_torch.solving.solution import Solution
 
 
@@ -134,13 +134,15 @@ class _Run:
     def result(self) -> SolveResult:
         best: tuple[Solution, Certificate] | None = None
         message, interrupted, n_certified = "", False, 0
-        seconds, watch = 0.0, Stopwatch()  # certificates apart
+        seconds = 0.0  # certificates apart
         try:
             for start in range(self.solver.n_starts):
                 self.start = start
                 watch = Stopwatch()
-                candidate, note = self._one_start()
-                seconds += watch.seconds
+                try:
+                    candidate, note = self._one_start()
+                finally:
+                    seconds += watch.seconds
                 message = note or message
                 if candidate is None:
                     continue
@@ -154,7 +156,6 @@ class _Run:
                     break
         except (_Interrupted, KeyboardInterrupt):
             interrupted, message = True, "interrupted; the best stage so far is kept"
-            seconds += watch.seconds
         solution = best[0] if best else self._last_stage()
         if solution is not None:
             self.observer.solution(solution)
@@ -243,7 +244,13 @@ class _Run:
         return kept, message
 
     def _trusted(self, solution: Solution) -> bool:
-        """Whether the stage's equations hold between the nodes too (a weak form claims its moments only)."""
+        """Whether the stage's equations hold between the nodes too (a weak form claims its moments only).
+
+        A refinement that reads no arcs off the curve may start from any stage: a coarse one needs more segments.
+        """
+        refinement = self.solver.refinement
+        if refinement is not None and not refinement.reads_arcs:
+            return True
         if not isinstance(solution.curve.collocation.discretisation.form, Strong):
             return True
         curve, points = solution.curve, solution.curve.collocation.discretisation.nodes.points
@@ -257,8 +264,6 @@ class _Run:
         refinement = self.solver.refinement
         if refinement is None:
             return smoothed, ""
-        if isinstance(refinement, Subdivide):
-            smoothed = self._last_stage() or smoothed  # more segments are what an untrusted stage needs
         name = type(refinement).__name__.lower()
         self.observer.stage_started(name, None, len(self.stages))
         refined = refinement.run(smoothed.curve, self._callback)
