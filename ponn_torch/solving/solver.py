@@ -35,8 +35,9 @@ from ponn_torch.solving.certificate import Certificate, Tolerances, certify
 from ponn_torch.solving.continuation import Ladder, Outcome, Schedule
 from ponn_torch.solving.guess import Guess, RandomGuess, project
 from ponn_torch.solving.observer import Observer, SilentObserver, StageResult
-from ponn_torch.solving.refinement import Refinement, Split
+from ponn_torch.solving.refinement import Refinement
 from ponn_torch.solving.solution import Solution
+from ponn_torch.solving.split import Split
 
 
 def _default_optimizer() -> Optimizer:

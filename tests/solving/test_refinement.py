@@ -18,8 +18,9 @@ from ponn_torch.optimal_control.curve import Curve
 from ponn_torch.optimal_control.discretisation import Discretisation
 from ponn_torch.optimal_control.pontryagin import Setting
 from ponn_torch.solving.guess import RandomGuess, project
-from ponn_torch.solving.refinement import Outcome, Split, Subdivide
+from ponn_torch.solving.refinement import Outcome, Subdivide
 from ponn_torch.solving.solution import Solution
+from ponn_torch.solving.split import Split
 from ponn_torch.solving.switching import find_structure
 
 OPTIMA = {"earth_mars": 396.05984393, "mars_landing": 268.0146563274}
