@@ -63,6 +63,10 @@ class DenseJacobian:
     def dense(self) -> Tensor:
         return self.matrix
 
+    def columns(self, chosen: Tensor) -> DenseJacobian:
+        """The Jacobian with respect to some of the unknowns, ascending positions (M,)."""
+        return DenseJacobian(self.matrix[..., chosen])
+
     def solve_damped(self, residual: Tensor, damping: Tensor, scale: Tensor, method: str = "cholesky") -> Tensor:
         """Step p (..., N); μ (...,), D = diag(scale) with scale (..., N)."""
         return _METHODS[method][0](self, residual, damping.unsqueeze(-1), scale)
@@ -163,6 +167,18 @@ class ArrowJacobian:
             out[..., i * rows : (i + 1) * rows, i * own : (i + 1) * own] = self.local[..., i, :, :]
         out[..., k * rows :, self.n_own :] = self.extra
         return out
+
+    def columns(self, chosen: Tensor) -> ArrowJacobian | DenseJacobian:
+        """With respect to some of the unknowns, ascending; an arrow where every segment keeps the same of its own."""
+        k, width = self.local.shape[-3], self.local.shape[-1]
+        own, shared = chosen[chosen < self.n_own], chosen[chosen >= self.n_own] - self.n_own
+        kept = own[: len(own) // k]
+        first = width * torch.arange(k, device=own.device)
+        if not torch.equal(own, (first[:, None] + kept).flatten()):
+            return DenseJacobian(self.dense()[..., chosen])
+        place = torch.full((self.n_shared + 1,), len(shared), device=own.device)
+        place[shared] = torch.arange(len(shared), device=own.device)
+        return ArrowJacobian(self.local[..., kept], self.shared, self.extra[..., shared], place[self.index])
 
     def solve_damped(self, residual: Tensor, damping: Tensor, scale: Tensor, method: str = "cholesky") -> Tensor:
         """Step p (..., N); the segments' own unknowns are eliminated first: K small factorisations, one of size G."""

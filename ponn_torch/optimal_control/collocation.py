@@ -156,9 +156,9 @@ class Collocation:
         return len(self.free_knots) + len(self.free_times) + self.bvp.n_multipliers
 
     @property
-    def linear_unknowns(self) -> slice:
-        """The output layer: coefficients that enter the expressions linearly."""
-        return slice(0, self.n_weights)
+    def linear_unknowns(self) -> Tensor:
+        """All unknowns but hidden weights: the output layers and what the segments share."""
+        return torch.arange(self.n_unknowns, device=self.known_times.device)
 
     def unpack(self, xi: Tensor) -> Unknowns:
         """Read ξ (..., N); fixed knots and times are filled in."""
