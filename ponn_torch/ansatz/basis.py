@@ -13,6 +13,8 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from ponn_torch.numerics.nodes import differentiation_matrix, interpolation_matrix
+
 
 class LinearBasis(nn.Module, ABC):
     """`size` functions phi_l, tabulated with their derivatives by `features`."""
@@ -231,3 +233,34 @@ class GaussianRBF(LinearBasis):
     def features(self, z: Tensor, order: int) -> Tensor:
         slopes = self.shape.unsqueeze(-2)
         return ACTIVATIONS["gaussian"](slopes * (z[:, None] - self.centres), order) * _powers(slopes, order)
+
+
+class Lagrange(LinearBasis):
+    """Polynomials that are 1 at one of the points and 0 at the others: weights are values at the points (L,).
+
+    Raises ValueError when two points coincide.
+    """
+
+    points: Tensor
+
+    def __init__(
+        self,
+        points: Sequence[float] | Tensor,
+        *,
+        dtype: torch.dtype = torch.float64,
+        device: torch.device | str = "cpu",
+    ) -> None:
+        positions = torch.as_tensor(points, dtype=dtype, device=device)
+        super().__init__(positions.shape[-1])
+        self.register_buffer("points", positions)
+
+    @property
+    def arguments(self) -> dict[str, Any]:
+        return {"points": self.points.tolist()}
+
+    def features(self, z: Tensor, order: int) -> Tensor:
+        stack = [interpolation_matrix(self.points, z)]
+        slopes = differentiation_matrix(self.points)
+        for _ in range(order):
+            stack.append(stack[-1] @ slopes)
+        return torch.stack(stack)

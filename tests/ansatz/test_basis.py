@@ -5,7 +5,7 @@ import pytest
 import torch
 from torch.func import jacfwd, vmap
 
-from ponn_torch.ansatz.basis import ACTIVATIONS, Chebyshev, GaussianRBF, Legendre, RandomFeatures
+from ponn_torch.ansatz.basis import ACTIVATIONS, Chebyshev, GaussianRBF, Lagrange, Legendre, RandomFeatures
 
 BASES = {
     "chebyshev": lambda: Chebyshev(9),
@@ -152,3 +152,14 @@ def test_dtype_is_an_argument():
 def test_errors_name_field_value_and_what_is_allowed(make, message):
     with pytest.raises(ValueError, match=message):
         make()
+
+
+def test_lagrange_weights_are_values_at_the_points() -> None:
+    basis = Lagrange((-0.9, -0.2, 0.3, 1.0))
+    z = torch.linspace(-1.0, 1.0, 6, dtype=torch.float64)
+    jet = basis.jet((basis.points**3 - 2.0 * basis.points)[:, None], z, 2)[..., 0]
+    expected = torch.stack([z**3 - 2.0 * z, 3.0 * z**2 - 2.0, 6.0 * z])
+    assert (jet - expected).abs().max() < 1e-13
+    assert basis.arguments == {"points": [-0.9, -0.2, 0.3, 1.0]}
+    with pytest.raises(ValueError, match="holds a point twice"):
+        Lagrange((0.0, 0.5, 0.5)).features(z, 0)
