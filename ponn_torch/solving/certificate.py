@@ -51,7 +51,8 @@ class Certificate:
     """Measured errors of one solution, and the verdict on them.
 
     Attributes:
-        end_error_scaled: states and costates flown; worst scaled component of the boundary conditions.
+        end_error_scaled: states and costates flown; worst scaled component of the boundary conditions, and of
+            the jumps where an error that grows too fast made the flight restart on the curve (``n_restarts``).
         end_errors: norms of the same per state, user units.
         control_end_error_scaled, control_end_errors: the same for the control alone.
         sign_violation: deepest S on the wrong side; None where no arcs are claimed.
@@ -81,6 +82,7 @@ class Certificate:
     known_cost: float | None
     cost_error: float | None
     explicit_time: bool
+    n_restarts: int = 0
     tolerances: Tolerances = field(default_factory=Tolerances)
     seconds: float = 0.0
 
@@ -97,8 +99,9 @@ class Certificate:
     def to_text(self) -> str:
         """A table of what was measured, what is allowed, and the verdict."""
         t = self.tolerances
+        again = f", {self.n_restarts} restarts" if self.n_restarts else ""
         checks = (
-            ("end error, states and costates flown", self.end_error_scaled, t.end_error),
+            (f"end error, states and costates flown{again}", self.end_error_scaled, t.end_error),
             ("end error, control alone flown", self.control_end_error_scaled, t.end_error),
             ("drift of the Hamiltonian", self.hamiltonian_drift, t.hamiltonian_drift),
             ("switching function on the wrong side", self.sign_violation, t.sign_violation),
@@ -107,11 +110,12 @@ class Certificate:
             ("transversality", self.transversality, t.transversality),
             ("free final time", self.free_time, t.transversality),
         )
+        width = max(40, *(len(name) + 2 for name, _, _ in checks))
         lines = [f"{self.problem}: {self.verdict}", ""]
-        lines.append(f"{'check (scaled)':<40}{'measured':>12}{'allowed':>12}")
+        lines.append(f"{'check (scaled)':<{width}}{'measured':>12}{'allowed':>12}")
         for name, value, allowed in checks:
             if value is not None:
-                lines.append(f"{name:<40}{value:>12.2e}{allowed:>12.1e}{'' if value <= allowed else '  FAILS'}")
+                lines.append(f"{name:<{width}}{value:>12.2e}{allowed:>12.1e}{'' if value <= allowed else '  FAILS'}")
         lines.append("")
         for name, value in self.end_errors.items():
             alone = self.control_end_errors[name]
@@ -155,6 +159,7 @@ def certify(solution: Solution, tolerances: Tolerances | None = None) -> Certifi
         "known_cost": known,
         "cost_error": None if known is None else flown_cost - known,
         "explicit_time": explicit_time,
+        "n_restarts": len(extremal.jumps),
     }
     faults = _faults(solution, measured, tolerances)
     faults += [flight.message for flight in (extremal, control) if not flight.arrived]

@@ -58,7 +58,7 @@ def _by_state(solution: Solution, x: Tensor) -> dict[str, float]:
 
 
 def end_errors(solution: Solution, flight: Flight) -> tuple[float, dict[str, float]]:
-    """Boundary conditions of the flown extremal: worst scaled component, final norms per state."""
+    """Boundary conditions of the flown extremal: worst scaled component, jumps among them; final norms per state."""
     bvp, n = solution.reference, solution.bvp.n_states
     w = _last(solution, flight)[1][0, : bvp.dimension]
     start = torch.from_numpy(flight.y[0, : bvp.dimension].copy())
@@ -66,6 +66,7 @@ def end_errors(solution: Solution, flight: Flight) -> tuple[float, dict[str, flo
     for value, known in ((start, bvp.known_initial), (w[:n], bvp.known_final[:n])):
         given = ~torch.isnan(known)
         misses.append((value - known)[given])
+    misses.append(w.new_tensor(flight.jumps))
     return _worst(torch.cat(misses)), _by_state(solution, bvp.to_physical(w)[0])
 
 

@@ -1,8 +1,8 @@
-"""A solution flown by DOP853, which knows nothing of its basis; restarted exactly at the switches."""
+"""A solution flown by DOP853, which knows nothing of its basis; begun anew exactly at the switches."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -18,6 +18,7 @@ from ponn_torch.numerics.tracing import trace
 from ponn_torch.optimal_control.control_laws import Regime
 from ponn_torch.optimal_control.pontryagin import Setting
 from ponn_torch.optimal_control.problem import Named
+from ponn_torch.solving.growth import restarts
 from ponn_torch.solving.solution import Solution
 
 Array = NDArray[np.floating]
@@ -33,6 +34,7 @@ class Flight:
     Attributes:
         t (m,), y (m, ·): scaled times and integrated values. arc (m,): index of the arc that each belongs to.
         arrived: the end was reached; ``message`` says why not.
+        jumps: largest step from what was flown onto the given values, per restart.
     """
 
     t: Array
@@ -41,6 +43,7 @@ class Flight:
     n_evaluations: int
     arrived: bool
     message: str = ""
+    jumps: tuple[float, ...] = ()
 
 
 def fly(
@@ -49,15 +52,20 @@ def fly(
     start: Array,
     resolution: list[PiecewiseChebyshev],
     *,
+    restarts: Sequence[tuple[float, Array]] = (),
     most_steps: int = 20000,
 ) -> Flight:
     """Integrate over the arcs between ``knots``, entering a panel of ``resolution`` by its length.
 
     The panels resolve the control, so that no thin layer of a smoothed switch lies between two stages unseen.
+    ``restarts`` are times at which the first entries of y are put back to given values.
     """
-    times, values, arcs, y = [], [], [], start
+    times, values, arcs, jumps, y = [], [], [], [], start
     n_evaluations, message = 0, ""
-    for arc, (begin, end) in enumerate(pairwise(knots)):
+    for arc, begin, end, given in _legs(knots, restarts):
+        if given is not None:
+            jumps.append(float(np.abs(y[: len(given)] - given).max()))
+            y = np.concatenate([given, y[len(given) :]])
         edges = np.asarray(resolution[arc].edges)
         lengths = np.diff(edges)
 
@@ -102,7 +110,19 @@ def fly(
         n_evaluations,
         solver.status == "finished",
         message,
+        tuple(jumps),
     )
+
+
+def _legs(
+    knots: list[float], restarts: Sequence[tuple[float, Array]]
+) -> Iterator[tuple[int, float, float, Array | None]]:
+    """(arc, begin, end, values to begin with or None) of every uninterrupted stretch."""
+    for arc, (begin, end) in enumerate(pairwise(knots)):
+        inside = [(t, w) for t, w in restarts if begin < t < end]
+        starts: list[tuple[float, Array | None]] = [(begin, None), *inside]
+        for (t, given), (after, _) in pairwise([*starts, (end, None)]):
+            yield arc, t, after, given
 
 
 # -- what is flown -------------------------------------------------------------------------------------------
@@ -141,7 +161,10 @@ def _point_setting(solution: Solution, smoothing: Tensor | None, arcs: Tensor | 
 
 
 def fly_extremal(solution: Solution, history: list[PiecewiseChebyshev], *, explicit_time: bool) -> Flight:
-    """States and costates from the found start under the regime's law; y = (w, ∫L dt, ∫∂H/∂t dt)."""
+    """States and costates from the found start under the regime's law; y = (w, ∫L dt, ∫∂H/∂t dt).
+
+    Where an error would grow beyond what float64 holds, the flight is put back onto the curve, and the jumps count.
+    """
     bvp, given = solution.reference, solution.curve.collocation.setting.regime
     smoothing = torch.zeros(1, dtype=torch.float64) if given.smoothing is None else given.smoothing.double().cpu()
     codes = torch.zeros(1, 1, dtype=torch.long)
@@ -165,7 +188,7 @@ def fly_extremal(solution: Solution, history: list[PiecewiseChebyshev], *, expli
         with torch.inference_mode():
             return graph(t0.new_tensor([t]), torch.from_numpy(y), codes[arc]).numpy()
 
-    return fly(rates, arc_knots(solution), y0.numpy(), history)
+    return fly(rates, arc_knots(solution), y0.numpy(), history, restarts=restarts(solution))
 
 
 def fly_control(solution: Solution, history: list[PiecewiseChebyshev]) -> Flight:

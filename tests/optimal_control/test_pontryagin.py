@@ -117,8 +117,19 @@ def double_integrator(force: Callable[[Tensor], Tensor]) -> Callable[..., Rates]
     return lambda x, c: {"x": x.v, "v": force(c.v), "lambda_x": torch.zeros_like(c.x), "lambda_v": -c.x}
 
 
+def boundary_layer(x, c) -> Rates:
+    epsilon = 0.02
+    return {
+        "x": x.y - x.x,
+        "y": (-c.y / epsilon - x.y) / epsilon,
+        "lambda_x": c.x - x.x,
+        "lambda_y": c.y / epsilon - c.x,
+    }
+
+
 CANTED = 1 / (225.0 * G0 * math.cos(math.radians(27.0)))
 BY_HAND: dict[str, Callable[..., Rates]] = {
+    "boundary_layer": boundary_layer,
     "minimum_energy": double_integrator(lambda costate: -costate),
     # S = −λv (u_max − u_min) in units of H
     "minimum_time": double_integrator(lambda costate: torch.tanh(-2 * costate / RHO)),

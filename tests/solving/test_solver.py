@@ -17,6 +17,7 @@ from ponn_torch.optimal_control.control_laws import Unconstrained
 from ponn_torch.optimal_control.curve import Curve
 from ponn_torch.optimal_control.pontryagin import pontryagin
 from ponn_torch.optimal_control.problem import OptimalControlProblem
+from ponn_torch.problems.boundary_layer import exact_cost
 from ponn_torch.solving.certificate import certify
 from ponn_torch.solving.continuation import Ladder, Single
 from ponn_torch.solving.guess import RandomGuess, project
@@ -51,6 +52,7 @@ class Answer:
 PAPER_UNITS = {"r": 1000 / AU, "v": 1000 / (AU / YEARLY), "m": 1.0}
 ENERGY_UNITS = {"r": AU / CANONICAL**3, "v": AU / CANONICAL**2}
 ANSWERS = {
+    "boundary_layer": Answer(exact_cost(0.02, 1.0, 0.0, 1.0), 1e-12),
     "minimum_energy": Answer(6.0, 1e-12),
     "minimum_time": Answer(2.0, 1e-12, ("max", "min"), (1.0,), 1e-12, 2.0),
     "minimum_fuel": Answer(
