@@ -25,7 +25,7 @@ class Status(Enum):
     MAX_ITERATIONS = "the iteration limit was reached"
     TIME_LIMIT = "the CPU time limit was reached"
     HOPELESS = "the residual was still above the limit that tells a failed start"
-    NON_FINITE = "the Jacobian is not finite at the best point"
+    NON_FINITE = "the residual or its Jacobian is not finite at the best point"
     INTERRUPTED = "interrupted from the keyboard"
 
     @property
@@ -101,10 +101,15 @@ class NonFiniteResidual(FloatingPointError):
     """The residual is not finite at a starting point; the message names equations."""
 
 
-def check_start(residual: Residual, value: Tensor) -> None:
-    """Raise NonFiniteResidual if the starting residual is not finite anywhere in the batch, naming the equations."""
-    if bool(torch.isfinite(value).all()):
-        return
+def check_start(residual: Residual, value: Tensor) -> Tensor:
+    """Members (...,) of a batch whose starting residual (..., R) is finite; the others can only fail, alone.
+
+    Raises:
+        NonFiniteResidual: no member's residual is finite; the message names the equations.
+    """
+    finite = torch.isfinite(value).all(-1)
+    if bool(finite.any()):
+        return finite
     bad = [name for name, norm in residual.blocks(value).items() if not bool(torch.isfinite(norm).all())]
     raise NonFiniteResidual(
         f"the residual is not finite at the starting point, in the equations of: {', '.join(bad)}; "

@@ -94,16 +94,16 @@ class LevenbergMarquardt:
         """Minimise ½‖r(ξ)‖² from ξ (..., N).
 
         Raises:
-            NonFiniteResidual: r is not finite at the start.
+            NonFiniteResidual: r is not finite at the start, in no member of the batch; alone, a member has failed.
         """
         rule, watch = self.stopping, Stopwatch()
         r, jacobian = residual.linearise(xi)
-        check_start(residual, r)
+        finite = check_start(residual, r)
         cost = r.square().sum(-1)
         scale = self._scale(jacobian, None)
         damping = torch.full_like(cost, self.damping)
         growth = torch.full_like(cost, 2.0)
-        code = torch.full(cost.shape, _RUNNING, dtype=torch.long, device=cost.device)
+        code = torch.where(finite, _RUNNING, _code(Status.NON_FINITE))
         slow = torch.zeros_like(code)
         records: list[Record] = []
         n_residuals, n_linear, tiny = 0, 1, torch.finfo(cost.dtype).tiny
@@ -137,9 +137,9 @@ class LevenbergMarquardt:
                 records.append(
                     record(
                         iteration=iteration,
-                        norm=norm.median() if norm.dim() else norm,
-                        damping=damping.median() if norm.dim() else damping,
-                        step=step_norm.median() if norm.dim() else step_norm,
+                        norm=norm.nanmedian() if norm.dim() else norm,
+                        damping=damping.nanmedian() if norm.dim() else damping,
+                        step=step_norm.nanmedian() if norm.dim() else step_norm,
                         accepted=accepted.any(),
                         running=int(running.sum()),
                         residuals=n_residuals,
@@ -230,7 +230,11 @@ class GaussNewton:
 
 @dataclass(frozen=True)
 class ScipyLeastSquares:
-    """scipy.optimize.least_squares on the same residual: ``trf`` (the PoNN paper's landing), ``lm`` or ``dogbox``."""
+    """scipy.optimize.least_squares on the same residual: ``trf`` (the PoNN paper's landing), ``lm`` or ``dogbox``.
+
+    The rules of ``stopping`` are applied here, after every residual that SciPy asks for, so that they mean what they
+    mean elsewhere; of SciPy's own only ``step`` and round-off are left.
+    """
 
     method: str = "trf"
     stopping: Stopping = field(default_factory=Stopping)
@@ -248,16 +252,22 @@ class ScipyLeastSquares:
         count = {"residuals": 0, "linearisations": 0}
         best: list[tuple[float, Tensor]] = [(float("inf"), xi)]
         stopped: list[Status] = []
+        slow = 0
 
         def tensor(x: np.ndarray) -> Tensor:
             return torch.as_tensor(x, dtype=xi.dtype, device=xi.device)
 
         def function(x: np.ndarray) -> np.ndarray:
+            nonlocal slow
             point = tensor(x.copy())
             r = residual.residual(point)
             count["residuals"] += 1
-            norm = float(r.norm())
-            improved = norm < best[0][0]
+            norm, before = float(r.norm()), best[0][0]
+            improved = norm < before
+            if not torch.equal(point, best[0][1]):  # SciPy asks for some points twice
+                # as in Levenberg–Marquardt, a rejected step next to the best norm counts, one far off does not
+                near = abs(before**2 - norm**2) < rule.decrease * before**2
+                slow = slow + 1 if near else 0 if improved else slow
             if improved:
                 best[0] = (norm, point)
             records.append(
@@ -276,7 +286,10 @@ class ScipyLeastSquares:
             if on_iteration is not None:
                 on_iteration(records[-1], best[0][1], r)
             for condition, status in (
-                (norm < rule.tolerance, Status.RESIDUAL),
+                (best[0][0] < rule.tolerance and not rule.past_tolerance, Status.RESIDUAL),
+                (before < rule.tolerance and norm > before and rule.past_tolerance, Status.ROUND_OFF),
+                (slow >= rule.patience, Status.SMALL_DECREASE),
+                (best[0][0] > rule.hopeless and len(records) >= rule.hopeless_after, Status.HOPELESS),
                 (watch.seconds > rule.cpu_seconds, Status.TIME_LIMIT),
             ):
                 if condition:
@@ -295,7 +308,7 @@ class ScipyLeastSquares:
                 jac=jacobian,
                 method=self.method,
                 x_scale="jac",
-                ftol=max(rule.decrease, 2.3e-16),
+                ftol=2.3e-16,
                 xtol=max(rule.step, 2.3e-16),
                 gtol=2.3e-16,
                 max_nfev=rule.max_iterations,

@@ -1,13 +1,13 @@
 """Continuation: in which order the values of a parameter are tried, and when to stop.
 
-A schedule decides values only. The conductor solves: it calls ``attempt(value, parameter, form)``, keeps the warm
-start, and answers with an Outcome; a failed attempt leaves the last good point as the next start.
+A schedule decides values only. The conductor solves: it is called by ``attempt(value, parameter, form)``, keeps the
+warm start, and answers with an Outcome; a failed attempt leaves the last good point as the next start.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import Enum
 from typing import Protocol
@@ -20,11 +20,15 @@ class Outcome(Enum):
 
     SOLVED = "solved"
     UNCHANGED = "solved, and the same as before: smaller values change nothing"
+    UNTRUSTED = "solved at the nodes, but not between them"
     FAILED = "not solved"
     ABORT = "give this start up"
 
 
-Attempt = Callable[[float, str, Form | None], Outcome]
+class Attempt(Protocol):
+    def __call__(self, value: float, parameter: str, form: Form | None, *, hold: bool = False) -> Outcome:
+        """Solve at a value; with ``hold``, a stage that is not trusted is no start of the next one."""
+        ...
 
 
 class Schedule(Protocol):
@@ -71,7 +75,10 @@ def log_ladder(
 
 @dataclass(frozen=True)
 class Adaptive:
-    """Multiply the value by ``factor`` until ``last``; halve the step (in the logarithm) where an attempt fails."""
+    """Multiply the value by ``factor`` until ``last``; halve the step (in the logarithm) where an attempt fails.
+
+    A stage that is not trusted between the nodes has failed too: the next one starts from the last that is.
+    """
 
     first: float = 1.0
     last: float = 1e-2
@@ -93,7 +100,7 @@ class Adaptive:
         while towards * (math.log(self.last) - math.log(value)) > 1e-12:
             step = -math.log(self.factor) / 2**halvings
             exponent = min(step, abs(math.log(self.last / value)))
-            outcome = attempt(value * math.exp(towards * exponent), self.parameter, self.form)
+            outcome = attempt(value * math.exp(towards * exponent), self.parameter, self.form, hold=True)
             if outcome is Outcome.ABORT or outcome is Outcome.UNCHANGED:
                 return
             if outcome is Outcome.SOLVED:
@@ -113,9 +120,9 @@ class Phases:
     def run(self, attempt: Attempt) -> None:
         gone = False
 
-        def watched(value: float, parameter: str, form: Form | None) -> Outcome:
+        def watched(value: float, parameter: str, form: Form | None, *, hold: bool = False) -> Outcome:
             nonlocal gone
-            outcome = attempt(value, parameter, form)
+            outcome = attempt(value, parameter, form, hold=hold)
             gone = gone or outcome is Outcome.ABORT
             return outcome
 

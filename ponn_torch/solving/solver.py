@@ -209,7 +209,7 @@ class _Run:
         message = ""
         first = True
 
-        def attempt(value: float, parameter: str, form: Form | None) -> Outcome:
+        def attempt(value: float, parameter: str, form: Form | None, *, hold: bool = False) -> Outcome:
             nonlocal current, xi, kept, message, first
             trial = replace(current, discretisation=self._discretisation(form))
             if parameter != "smoothing" or self._smoothable:
@@ -232,14 +232,19 @@ class _Run:
             if failed:
                 return Outcome.FAILED
             first = False
+            trusted = self._trusted(solution)
+            if hold and not trusted:
+                return Outcome.UNTRUSTED
             change = float((result.xi - xi).abs().max())
             current, xi = trial, result.xi
-            if self._trusted(solution):
+            if trusted:
                 kept = solution
             elif kept is None:
                 kept = solution
                 message = "no stage solves its own problem between the nodes; the first one is kept"
-            return Outcome.UNCHANGED if change < 1e-6 * float(xi.abs().max()) else Outcome.SOLVED
+            if change < 1e-6 * float(xi.abs().max()):
+                return Outcome.UNCHANGED
+            return Outcome.SOLVED if trusted else Outcome.UNTRUSTED
 
         solver.continuation.run(attempt)
         return kept, message

@@ -286,6 +286,22 @@ def test_a_start_that_is_not_finite_names_its_equations(optimizer):
         OPTIMIZERS[optimizer](Stopping()).run(residual, start)
 
 
+@pytest.mark.parametrize("linear_solver", ["cholesky", "qr"])
+def test_a_member_whose_start_is_not_finite_fails_alone(linear_solver):
+    residual = Pointwise(lambda x: torch.stack([10 * (x[1] - x[0] ** 2), torch.sqrt(1.5 - x[0]) - 0.5**0.5]))
+    starts = torch.tensor([[-1.2, 1.0], [2.0, 1.0], [0.3, -1.0]], dtype=torch.float64)
+    optimizer = LevenbergMarquardt(EXACT, linear_solver=linear_solver)
+    result = optimizer.run(residual, starts)
+    alone = [optimizer.run(residual, start) for start in starts[[0, 2]]]
+    assert [status is Status.NON_FINITE for status in result.member_status] == [False, True, False]
+    assert torch.equal(result.xi[1], starts[1])
+    assert bool(result.norm[1].isnan())
+    for member, reference in zip((0, 2), alone, strict=True):
+        torch.testing.assert_close(result.xi[member], reference.xi, rtol=1e-12, atol=1e-12)
+        assert result.member_status[member].stationary
+    assert all(np.isfinite(record["norm"]) for record in result.records)
+
+
 def test_a_collocation_residual_names_equations_by_state():
     residual, start = landing()
     bad = start.clone()
@@ -440,6 +456,29 @@ def test_scipy_stops_at_the_tolerance_and_at_the_limit():
         limited = ScipyLeastSquares(method, Stopping(max_iterations=4)).run(residual, start)
         assert limited.status is Status.MAX_ITERATIONS
         assert limited.n_residuals <= 5
+
+
+@pytest.mark.parametrize("method", ["trf", "lm", "dogbox"])
+def test_scipy_obeys_the_rules_of_stopping(method):
+    def run(name: str, **rules: float) -> tuple[Status, list[float]]:
+        residual, start = start_of(name)
+        given = {"tolerance": 0.0, "decrease": 0.0, "max_iterations": 500} | rules
+        seen: list[float] = []
+        stopping = Stopping(**given)
+        result = ScipyLeastSquares(method, stopping).run(residual, start, lambda _, xi, r: seen.append(float(r.norm())))
+        return result.status, seen
+
+    status, seen = run("rosenbrock", hopeless=1e-3, hopeless_after=5)
+    assert status is Status.HOPELESS
+    assert len(seen) == 5
+    # the smallest norm is not zero: the last decreases are small, one after the other
+    few, many = (run("exponential_fit", decrease=1e-2, patience=patience) for patience in (1, 3))
+    assert few[0] is many[0] is Status.SMALL_DECREASE
+    assert len(many[1]) >= len(few[1]) + 2
+    status, seen = run("powell_singular", tolerance=1e-3, past_tolerance=True)
+    assert len(seen) > len(run("powell_singular", tolerance=1e-3)[1])
+    if status is Status.ROUND_OFF:
+        assert seen[-1] > min(seen[:-1])
 
 
 def test_scipy_takes_one_problem_at_a_time():

@@ -18,7 +18,7 @@ def tried(schedule: Schedule, answer: Callable[[float, int], Outcome] = lambda v
     """What a schedule asks for: (value, parameter, form) of every attempt."""
     calls: list[tuple[float, str, object]] = []
 
-    def attempt(value, parameter, form):
+    def attempt(value, parameter, form, *, hold=False):
         calls.append((value, parameter, form))
         assert len(calls) < 1000
         return answer(value, len(calls))
@@ -101,6 +101,12 @@ def test_a_wall_is_approached_from_the_last_good_value():
     good = [value for value in found if value > 0.2]
     assert good == sorted(set(good), reverse=True)
     assert 0.2 < good[-1] < 0.21
+
+
+def test_an_untrusted_stage_is_a_failed_step_of_an_adaptive_schedule_only():
+    found = values(Adaptive(1.0, 1e-2, 0.1), scripted(Outcome.SOLVED, Outcome.UNTRUSTED))
+    assert found[:3] == pytest.approx([1.0, 0.1, 10**-0.5])
+    assert values(Ladder((1.0, 0.3, 0.1)), scripted(*[Outcome.UNTRUSTED] * 3)) == [1.0, 0.3, 0.1]
 
 
 @pytest.mark.parametrize("outcome", [Outcome.FAILED, Outcome.ABORT])

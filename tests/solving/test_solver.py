@@ -19,7 +19,7 @@ from ponn_torch.optimal_control.pontryagin import pontryagin
 from ponn_torch.optimal_control.problem import OptimalControlProblem
 from ponn_torch.problems.boundary_layer import exact_cost
 from ponn_torch.solving.certificate import certify
-from ponn_torch.solving.continuation import Ladder, Single
+from ponn_torch.solving.continuation import Adaptive, Ladder, Single
 from ponn_torch.solving.guess import RandomGuess, project
 from ponn_torch.solving.observer import Observer
 from ponn_torch.solving.paths import PolarTransfer
@@ -292,6 +292,16 @@ def test_the_sharpest_trusted_stage_is_kept():
     assert by_smoothing[1e-4] > 0.1 > by_smoothing[0.1]
     assert result.solution.smoothing > 1e-3
     assert not result.certified  # one polynomial is not enough for the defaults
+
+
+def test_an_adaptive_schedule_halves_its_step_where_a_stage_is_not_trusted():
+    solver = Solver(refinement=None, n_starts=1, continuation=Adaptive(1.0, 1e-3, 0.1, max_halvings=2))
+    result = solver.solve(problem("mars_landing"))
+    tried = [stage.smoothing for stage in result.stages]
+    untrusted = tried.index(pytest.approx(1e-2))
+    assert tried[:untrusted] == pytest.approx([1.0, 0.1])
+    assert tried[untrusted + 1] == pytest.approx(10**-1.5)  # half a step from the last good one
+    assert result.solution.smoothing < 0.1
 
 
 def test_an_infeasible_transfer_is_recognised_early_with_a_message():
