@@ -2,10 +2,10 @@
 
 Segment k spans [t_k, t_{k+1}] with half length h and z ∈ [−1, 1]. A chain of q unknowns is one constrained
 expression y whose value and derivatives below q at both ends come from a knot table of w (K+1, 2n), so that
-y^(e) = h^−e (B_e β + Ω_e κ) in time, with tables B and Ω that depend on neither times nor targets (PoNN paper,
-eq. 20 and 54–65; K = 1 is its single domain). Per chain one equation is left: y^(q) = h^q F. Unknowns, in the order of
-the vector ξ: the coefficients β of every segment, the free knot entries, the free knot times, the multipliers of a
-terminal manifold.
+y^(e) = h^−e (g + Ω(κ − C[g]))^(e) in time, where neither the free function g nor Ω depends on times or targets (PoNN
+paper, eq. 20 and 54–65; K = 1 is its single domain). Per chain one equation is left: y^(q) = h^q F. Unknowns, in the
+order of the vector ξ: the weights of every segment's free functions, the free knot entries, the free knot times, the
+multipliers of a terminal manifold.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from torch.func import vjp, vmap
 
 from ponn_torch.numerics.linalg import ArrowJacobian
 from ponn_torch.optimal_control.control_laws import Regime
-from ponn_torch.optimal_control.discretisation import Discretisation, Group
+from ponn_torch.optimal_control.discretisation import Discretisation
 from ponn_torch.optimal_control.linearisation import linearise
 from ponn_torch.optimal_control.pontryagin import BoundaryValueProblem, Setting
 from ponn_torch.optimal_control.problem import nearest
@@ -28,7 +28,7 @@ from ponn_torch.optimal_control.problem import nearest
 
 @dataclass(frozen=True)
 class Unknowns:
-    """ξ taken apart: coefficients (..., K, n_own), knots (..., K+1, 2n), times (..., K+1), multipliers (..., M)."""
+    """ξ taken apart: weights (..., K, n_own), knots (..., K+1, 2n), times (..., K+1), multipliers (..., M)."""
 
     weights: Tensor
     knots: Tensor
@@ -158,7 +158,10 @@ class Collocation:
     @property
     def linear_unknowns(self) -> Tensor:
         """All unknowns but hidden weights: the output layers and what the segments share."""
-        return torch.arange(self.n_unknowns, device=self.known_times.device)
+        output, own = self.discretisation.expressions.output_layer, self.discretisation.n_own
+        segments = torch.arange(self.n_segments, device=output.device)
+        shared = torch.arange(self.n_weights, self.n_unknowns, device=output.device)
+        return torch.cat([(own * segments[:, None] + output).flatten(), shared])
 
     def unpack(self, xi: Tensor) -> Unknowns:
         """Read ξ (..., N); fixed knots and times are filled in."""
@@ -189,27 +192,21 @@ class Collocation:
 
     # -- evaluation at the nodes -------------------------------------------------------------------------------------
 
-    def kappa(self, group: Group, unknowns: Unknowns, h: Tensor) -> tuple[Tensor, Tensor]:
-        """Targets κ (..., K, d, 2q) in units of z and the factors (..., K, d, 2q) that made them from knot values."""
-        powers = torch.arange(group.order, dtype=h.dtype, device=h.device)
-        factors = group.factors * h[..., None, None] ** powers
-        values = unknowns.knots[..., group.columns]
-        both = torch.cat([values[..., :-1, :, :], values[..., 1:, :, :]], -1)
-        factors = torch.cat([factors, factors], -1)
-        return both * factors, factors
+    def kappas(self, unknowns: Unknowns, h: Tensor) -> tuple[list[Tensor], list[Tensor]]:
+        """Per group targets κ (..., K, d, 2q) in units of z, and the factors that made them from knot values."""
+        kappas, factors = [], []
+        for group in self.discretisation.groups:
+            powers = torch.arange(group.order, dtype=h.dtype, device=h.device)
+            factor = group.factors * h[..., None, None] ** powers
+            factors.append(torch.cat([factor, factor], -1))
+            values = unknowns.knots[..., group.columns]
+            kappas.append(torch.cat([values[..., :-1, :, :], values[..., 1:, :, :]], -1) * factors[-1])
+        return kappas, factors
 
     def jets(self, unknowns: Unknowns, h: Tensor) -> tuple[list[Tensor], list[Tensor], list[Tensor]]:
         """Per group the derivatives in z (..., K, d, q+1, n), κ, and the factors of κ."""
-        jets, kappas, factors = [], [], []
-        n = len(self.discretisation.nodes)
-        for group in self.discretisation.groups:
-            kappa, factor = self.kappa(group, unknowns, h)
-            beta = unknowns.weights[..., group.own].unflatten(-1, (group.n_chains, group.size))
-            jet = torch.cat([beta, kappa], -1) @ group.table
-            jets.append(jet.unflatten(-1, (group.order + 1, n)))
-            kappas.append(kappa)
-            factors.append(factor)
-        return jets, kappas, factors
+        kappas, factors = self.kappas(unknowns, h)
+        return self.discretisation.expressions.jets(unknowns.weights, kappas), kappas, factors
 
     def assemble(self, pieces: Sequence[Tensor]) -> Tensor:
         """Columns [group, derivative, chain] (..., K, ·, n) → w (..., K, n, 2n)."""

@@ -44,20 +44,10 @@ class Curve:
 
     def _jets(self, z: Tensor, segment: int) -> list[Tensor]:
         """Per group the derivatives in z (d, q+1, m) at z (m,) of one segment."""
-        unknowns, out = self.unknowns, []
         h = (self.times[1:] - self.times[:-1]) / 2
-        for group in self.collocation.discretisation.groups:
-            kappa, _ = self.collocation.kappa(group, unknowns, h)
-            beta = unknowns.weights[segment, group.own].unflatten(-1, (group.n_chains, group.size))
-            B, Omega = group.expression.tables(z, group.order)
-            out.append(
-                torch.einsum(
-                    "omk,dk->dom",
-                    torch.cat([B[..., : group.size], Omega], -1),
-                    torch.cat([beta, kappa[segment]], -1),
-                )
-            )
-        return out
+        kappas, _ = self.collocation.kappas(self.unknowns, h)
+        expressions, weights = self.collocation.discretisation.expressions, self.unknowns.weights
+        return expressions.jets_at(z, weights[segment], [kappa[segment] for kappa in kappas])
 
     def on_segment(self, z: Tensor, segment: int) -> tuple[Tensor, Tensor, Tensor]:
         """(t (m,), w (m, 2n), ẇ (m, 2n)) at z ∈ [−1, 1] of one segment; chained entries of ẇ are exact derivatives."""

@@ -1,4 +1,4 @@
-"""What a collocation residual is tabulated from: nodes, test functions, and the chains' constrained expressions.
+"""What a collocation residual is made from: nodes, test functions, and the chains' constrained expressions.
 
 Nothing here depends on unknowns, times or boundary values, so one discretisation serves every residual of a boundary
 value problem, whatever its segments.
@@ -15,9 +15,9 @@ from torch import Tensor
 from torch.func import vjp, vmap
 
 from ponn_torch.ansatz.basis import LinearBasis
-from ponn_torch.ansatz.constraints import hermite
-from ponn_torch.ansatz.expression import ConstrainedExpression
+from ponn_torch.ansatz.constraints import SwitchingFunctions, hermite
 from ponn_torch.numerics.nodes import NodeSet, legendre_moments
+from ponn_torch.optimal_control.expressions import Expressions, LinearExpressions
 from ponn_torch.optimal_control.pontryagin import BoundaryValueProblem, Chain, probe_points, probe_settings
 
 # -- test functions: how the pointwise residual becomes rows ---------------------------------------------------------
@@ -50,29 +50,25 @@ class Weak:
 Form = Strong | Weak
 
 
-# -- tables: all that does not depend on unknowns --------------------------------------------------------------------
+# -- groups: all that depends on neither unknowns nor free functions ---------------------------------------------------
 
 
 @dataclass(frozen=True, eq=False)
 class Group:
-    """Chains of one length that share tables; a trivial one has no free function.
+    """Chains of one length; a trivial one has no free function.
 
-    columns (d, q) of w, factors (d, q): y^(e) = factors[e] w[columns[e]]; table (L + 2q, (q+1) n) gives all derivatives
-    at all nodes from [β, κ] in one product; own and rows locate β and the equations inside a segment, active the
-    equations among those that use F; pointwise (n,) is the diagonal of the test matrix where it is one.
+    columns (d, q) of w, factors (d, q): y^(e) = factors[e] w[columns[e]]; Omega (q+1, n, 2q) is the table of the
+    switching functions at the nodes; test (rows, n) makes equations from pointwise ones, pointwise (n,) is its diagonal
+    where it is one; rows locates the equations inside a segment, active among those that use F.
     """
 
     order: int
     trivial: bool
     columns: Tensor
     factors: Tensor
-    expression: ConstrainedExpression
-    size: int
-    B: Tensor
+    switching: SwitchingFunctions
     Omega: Tensor
-    table: Tensor
     test: Tensor
-    own: slice
     rows: slice
     active: slice
     pointwise: Tensor | None
@@ -103,42 +99,33 @@ class Discretisation:
 
     def _group(self, order: int, trivial: bool, chains: Sequence[Chain], before: Group | None) -> Group:
         nodes, like = self.nodes, self.nodes.points
-        expression = ConstrainedExpression(
-            self.basis.beyond(2 * order),
-            hermite(order),
-            nodes=nodes,
-            order=order,
-            conditioning=self.conditioning,
-            dtype=like.dtype,
-            device=like.device,
-        )
-        B, Omega = expression.tables(like, order)
+        switching = SwitchingFunctions(hermite(order), dtype=like.dtype, device=like.device)
         # a trivial chain is the Hermite interpolant, of degree 2q−1: y^(q) = 0 has q coefficients to be met
         test = legendre_moments(nodes, order) if trivial else self.form.matrix(nodes)
-        B = B[..., :0] if trivial else B
-        size, used = B.shape[-1], 0 if trivial else len(chains)
-        own, rows, active = (before.own.stop, before.rows.stop, before.active.stop) if before else (0, 0, 0)
+        used = 0 if trivial else len(chains)
+        rows, active = (before.rows.stop, before.active.stop) if before else (0, 0)
         return Group(
             order=order,
             trivial=trivial,
             columns=torch.tensor([c.columns for c in chains], device=like.device),
             factors=torch.tensor([c.factors for c in chains], dtype=like.dtype, device=like.device),
-            expression=expression,
-            size=size,
-            B=B,
-            Omega=Omega,
-            table=torch.cat([B, Omega], -1).movedim(-1, 0).flatten(1),
+            switching=switching,
+            Omega=switching(like, order)[:, :, 0],
             test=test,
-            own=slice(own, own + len(chains) * size),
             rows=slice(rows, rows + len(chains) * test.shape[0]),
             active=slice(active, active + used),
             pointwise=test.diagonal() if isinstance(self.form, Strong) and not trivial else None,
         )
 
+    @cached_property
+    def expressions(self) -> Expressions:
+        """The constrained expressions of all chains, around the free function."""
+        return LinearExpressions(self, self.basis)
+
     @property
     def n_own(self) -> int:
-        """Coefficients per segment."""
-        return self.groups[-1].own.stop
+        """Weights per segment."""
+        return self.expressions.n_own
 
     @property
     def n_rows(self) -> int:

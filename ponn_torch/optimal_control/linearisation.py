@@ -1,7 +1,7 @@
 """The exact Jacobian of a collocation residual, block by block.
 
-F is differentiated at the nodes only: vmapped vjp gives ∂F_i/∂w for the equations in use, and the tables pull these
-cotangents back to coefficients and knots. Times enter by the chain rule through the half lengths. Nothing of the size
+F is differentiated at the nodes only: vmapped vjp gives ∂F_i/∂w for the equations in use, and the expressions pull
+these cotangents back to weights and knots. Times enter by the chain rule through the half lengths. Nothing of the size
 of the whole Jacobian is differentiated, which is what makes it cheap.
 """
 
@@ -15,7 +15,8 @@ from torch import Tensor
 from torch.func import vjp, vmap
 
 from ponn_torch.numerics.linalg import ArrowJacobian
-from ponn_torch.optimal_control.discretisation import Discretisation, Group
+from ponn_torch.optimal_control.discretisation import Discretisation
+from ponn_torch.optimal_control.expressions import Cotangents
 
 if TYPE_CHECKING:
     from ponn_torch.optimal_control.collocation import Collocation
@@ -23,25 +24,25 @@ if TYPE_CHECKING:
 
 def linearise(collocation: Collocation, xi: Tensor) -> tuple[Tensor, ArrowJacobian]:
     """r (..., R) and J at ξ (..., N)."""
-    disc, width = collocation.discretisation, collocation.bvp.dimension
+    disc = collocation.discretisation
     unknowns = collocation.unpack(xi)
     h = (unknowns.times[..., 1:] - unknowns.times[..., :-1]) / 2
     jets, kappas, factors = collocation.jets(unknowns, h)
     t, w = collocation.points(jets, unknowns.times, h)
     rates, by_t, by_w = _rates_and_slopes(collocation, t, w)
 
-    batch, k = xi.shape[:-1], collocation.n_segments
-    local = xi.new_zeros(*batch, k, disc.n_rows, disc.n_own)
-    shared = xi.new_zeros(*batch, k, disc.n_rows, 2 * width + 2)
+    slopes = _cotangents(disc, h, by_w)
+    local = disc.expressions.pull_back(unknowns.weights, slopes)
+    shared = local.new_zeros(*local.shape[:-1], 2 * disc.bvp.dimension + 2)
+    _by_knots(disc, slopes, factors, shared)
     by_h = _by_half_length(collocation, jets, kappas, h, rates, by_t, by_w)
     f, g = (fraction[:, None, None] for fraction in collocation.end_fractions)
     for group, stretch in zip(disc.groups, by_h, strict=True):
-        # the equations are y^(q) − scale F, (..., K, d); those of a trivial group have no F
-        scale = h[..., None] ** group.order * (group.factors[:0, -1] if group.trivial else group.factors[:, -1])
-        cotangents = -scale[..., None, :, None] * by_w[..., group.active, :]
-        _pull_back(disc, group, cotangents, h, factors, local, shared, width)
         # h = (t₁ − t₀)/2 and t = t₀ + h (z + 1): what depends on t apart from h moves with t₀
-        drift = torch.zeros_like(stretch) if group.trivial else -scale[..., None] * by_t[..., group.active].mT
+        drift = torch.zeros_like(stretch)
+        if not group.trivial:
+            scale = h[..., None] ** group.order * group.factors[:, -1]
+            drift = -scale[..., None] * by_t[..., group.active].mT
         by_start, by_end = drift - 0.5 * stretch, 0.5 * stretch
         anchors = torch.stack([(1 - f) * by_start + (1 - g) * by_end, f * by_start + g * by_end], -1)
         shared[..., group.rows, -2:] = (group.test @ anchors).flatten(-3, -2)
@@ -101,40 +102,39 @@ def _by_half_length(
     return out
 
 
-def _pull_back(
-    disc: Discretisation,
-    group: Group,
-    cotangents: Tensor,
-    h: Tensor,
-    kappa_factors: Sequence[Tensor],
-    local: Tensor,
-    shared: Tensor,
-    width: int,
-) -> None:
-    """Fill this group's rows of ``local`` and ``shared`` from ∂(pointwise equations)/∂w (..., K, n, d, 2n)."""
-    pointwise = group.pointwise  # √weights where rows are points: then no product with a test matrix is needed
-    for other, factor in zip(disc.groups, kappa_factors, strict=True):
-        shape = (*local.shape[:-2], group.n_chains, group.test.shape[0], other.n_chains)
-        by_own = (
-            local[..., group.rows, other.own].unflatten(-2, shape[-3:-1]).unflatten(-1, (other.n_chains, other.size))
+def _cotangents(disc: Discretisation, h: Tensor, by_w: Tensor) -> Cotangents:
+    """∂(pointwise equations)/∂(derivatives of the chains); a group's equations are y^(q) − scale F."""
+    out: dict[tuple[int, int], dict[int, Tensor]] = {}
+    for i, group in enumerate(disc.groups):
+        scale = h[..., None] ** group.order * group.factors[:, -1]
+        by_group = by_w[..., group.active, :]
+        for j, other in enumerate(disc.groups):
+            by_order = out[i, j] = {}
+            for e in disc.active_orders(group, other):
+                ratio = -scale[..., :, None] / (h[..., None] ** e * other.factors[:, e])[..., None, :]
+                # (..., K, d, n, d'): equation, node, chain that it depends on
+                c = (by_group[..., other.columns[:, e]] * ratio[..., None, :, :]).transpose(-3, -2)
+                by_order[e] = c if group.pointwise is None else c * group.pointwise[:, None]
+    return out
+
+
+def _by_knots(disc: Discretisation, cotangents: Cotangents, kappa_factors: Sequence[Tensor], shared: Tensor) -> None:
+    """Fill the knots' columns of ``shared``: y sees them through Ω κ."""
+    for (i, j), by_order in cotangents.items():
+        if not by_order and i != j:
+            continue
+        group, other = disc.groups[i], disc.groups[j]
+        by_kappa = shared.new_zeros(
+            *shared.shape[:-2], group.n_chains, len(group.test), other.n_chains, 2 * other.order
         )
-        by_kappa = local.new_zeros(*shape, 2 * other.order)
-        for e in disc.active_orders(group, other):
-            scale = h[..., None] ** e * other.factors[:, e]
-            # (..., K, d, n, d'): equation, node, chain that it depends on
-            c = (cotangents[..., other.columns[:, e]] / scale[..., None, None, :]).transpose(-3, -2)
-            if pointwise is not None:
-                c = (c * pointwise[:, None]).unsqueeze(-1)
-                by_own.addcmul_(c, other.B[e].unsqueeze(-2))
-                by_kappa.addcmul_(c, other.Omega[e].unsqueeze(-2))
+        for e, c in by_order.items():
+            if group.pointwise is not None:
+                by_kappa.addcmul_(c.unsqueeze(-1), other.Omega[e].unsqueeze(-2))
             else:
-                tables = torch.cat([other.B[e], other.Omega[e]], -1).unsqueeze(-2)
-                block = group.test @ (c.unsqueeze(-1) * tables).flatten(-2)
-                block = block.unflatten(-1, (other.n_chains, other.size + 2 * other.order))
-                by_own.add_(block[..., : other.size])
-                by_kappa.add_(block[..., other.size :])
-        if other is group:
-            by_own.diagonal(dim1=-4, dim2=-2).add_((group.test @ group.B[-1]).unsqueeze(-1))
+                product = group.test @ (c.unsqueeze(-1) * other.Omega[e].unsqueeze(-2)).flatten(-2)
+                by_kappa.add_(product.unflatten(-1, (other.n_chains, -1)))
+        if i == j:
             by_kappa.diagonal(dim1=-4, dim2=-2).add_((group.test @ group.Omega[-1]).unsqueeze(-1))
-        index = torch.cat([other.columns, other.columns + width], -1).flatten()
-        shared[..., group.rows, index] = (by_kappa * factor[..., None, None, :, :]).flatten(-4, -3).flatten(-2)
+        index = torch.cat([other.columns, other.columns + disc.bvp.dimension], -1).flatten()
+        block = by_kappa * kappa_factors[j][..., None, None, :, :]
+        shared[..., group.rows, index] = block.flatten(-4, -3).flatten(-2)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import torch
@@ -14,6 +14,7 @@ from ponn_torch.numerics.nodes import make_nodes
 from ponn_torch.optimal_control.collocation import Collocation, Unknowns
 from ponn_torch.optimal_control.curve import Curve
 from ponn_torch.optimal_control.discretisation import Discretisation, Strong
+from ponn_torch.optimal_control.expressions import LinearExpressions
 from ponn_torch.optimal_control.pontryagin import BoundaryValueProblem
 
 ScaledCurve = Callable[[Tensor], Tensor]  # scaled times (m,) → w (m, 2n)
@@ -38,19 +39,9 @@ def project(collocation: Collocation, curve: ScaledCurve, times: Tensor | None =
         times=times,
         multipliers=values.new_zeros(collocation.bvp.n_multipliers),
     )
-    for group in disc.groups:
-        if group.trivial:
-            continue
-        kappa, _ = collocation.kappa(group, unknowns, h)
-        fitted = group.expression.fit(
-            disc.nodes.points,
-            values[..., group.columns[:, 0]],
-            kappa.mT,
-            weights=disc.nodes.weights,
-            ridge=1e-18,
-        )
-        unknowns.weights[:, group.own] = fitted.mT.flatten(-2)
-    return collocation.pack(unknowns)
+    kappas, _ = collocation.kappas(unknowns, h)
+    weights = disc.expressions.fit([values[..., group.columns[:, 0]] for group in disc.groups], kappas)
+    return collocation.pack(replace(unknowns, weights=weights))
 
 
 class Guess(Protocol):
@@ -89,6 +80,8 @@ class RandomGuess:
         like = bvp.unit
         nodes = make_nodes("legendre_gauss", 2 * self.n_neurons, dtype=like.dtype, device=like.device)
         disc = Discretisation(bvp, Chebyshev(self.n_neurons), nodes, Strong(), "columns")
+        expressions = disc.expressions
+        assert isinstance(expressions, LinearExpressions)  # as Chebyshev polynomials are linear
         collocation = Collocation.on_segments(disc, like.new_tensor([0.0, bvp.final_time]))
         generator = torch.Generator().manual_seed(seed)
         draw = DISTRIBUTIONS[self.distribution]
@@ -99,10 +92,9 @@ class RandomGuess:
             known_mass = bvp.known_initial[mass]
             knots[:, mass] = torch.where(known_mass.isnan(), bvp.to_scaled(like, like)[mass], known_mass)
             knots[:, bvp.n_states + mass] = 1.0
-            for group in disc.groups:
+            for i, group in enumerate(disc.groups):
                 held = (group.columns[:, 0] == mass) | (group.columns[:, 0] == bvp.n_states + mass)
-                view = weights[0, group.own].unflatten(-1, (group.n_chains, group.size))
-                view[held] = 0.0
+                expressions.beta(i, weights)[:, held] = 0.0
         known = collocation.known_knots
         unknowns = Unknowns(
             weights,

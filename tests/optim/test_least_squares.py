@@ -305,7 +305,7 @@ def test_a_member_whose_start_is_not_finite_fails_alone(linear_solver):
 def test_a_collocation_residual_names_equations_by_state():
     residual, start = landing()
     bad = start.clone()
-    bad[residual.discretisation.groups[-1].own.start] = torch.nan
+    bad[residual.discretisation.expressions.tables[-1].own.start] = torch.nan
     with pytest.raises(NonFiniteResidual, match="not finite at the starting point") as caught:
         LevenbergMarquardt().run(residual, bad)
     named = str(caught.value).split("equations of: ")[1].split(";")[0].split(", ")

@@ -1,4 +1,4 @@
-"""A residual restricted to some unknowns is the residual, its Jacobian some columns, its solution the constrained one."""
+"""A residual restricted to some unknowns is the residual, its Jacobian some columns, the others are held."""
 
 from __future__ import annotations
 

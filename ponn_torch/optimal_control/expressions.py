@@ -1,0 +1,149 @@
+"""The constrained expressions y = g + Ω(κ − C[g]) of all chains of a segment: what depends on how g is written.
+
+A residual asks four things of them: derivatives at the nodes, derivatives anywhere, its own Jacobian with respect to
+the weights from that with respect to y, and a fit. Linear free functions answer from tables.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Protocol
+
+import torch
+from torch import Tensor
+
+from ponn_torch.ansatz.basis import LinearBasis
+from ponn_torch.ansatz.constraints import hermite
+from ponn_torch.ansatz.expression import ConstrainedExpression
+
+if TYPE_CHECKING:
+    from ponn_torch.optimal_control.discretisation import Discretisation, Group
+
+# [equations' group, chains' group][e]: ∂(equation d at node n)/∂y_d'^(e) as (..., K, d, n, d'), times √weight where
+# rows are points; the equations' own highest derivatives, of which each sees its own with factor 1, are left out
+Cotangents = Mapping[tuple[int, int], Mapping[int, Tensor]]
+
+
+class Expressions(Protocol):
+    """All chains of a segment, group by group; weights (..., K, n_own), targets κ per group (..., K, d, 2q)."""
+
+    @property
+    def n_own(self) -> int:
+        """Weights per segment."""
+        ...
+
+    @property
+    def output_layer(self) -> Tensor:
+        """Ascending positions of the weights that enter y linearly."""
+        ...
+
+    def jets(self, weights: Tensor, kappas: Sequence[Tensor]) -> list[Tensor]:
+        """Per group the derivatives in z at the nodes (..., K, d, q+1, n)."""
+        ...
+
+    def jets_at(self, z: Tensor, weights: Tensor, kappas: Sequence[Tensor]) -> list[Tensor]:
+        """Per group the derivatives (..., d, q+1, m) at z (m,) of a segment: weights (..., n_own), κ (..., d, 2q)."""
+        ...
+
+    def pull_back(self, weights: Tensor, cotangents: Cotangents) -> Tensor:
+        """∂(rows of a segment)/∂(its weights), (..., K, n_rows, n_own), at fixed κ."""
+        ...
+
+    def fit(self, values: Sequence[Tensor], kappas: Sequence[Tensor]) -> Tensor:
+        """Weights (..., K, n_own) whose y is nearest, at the nodes, to values per group (..., K, n, d)."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class _Tables:
+    """What the chains of a group share: B (q+1, n, L), [B | Ω] as (L + 2q, (q+1) n), and where their β stand."""
+
+    expression: ConstrainedExpression
+    B: Tensor
+    both: Tensor
+    own: slice
+
+    @property
+    def size(self) -> int:
+        return self.B.shape[-1]
+
+
+class LinearExpressions:
+    """β of every chain; one product with a table gives all derivatives at all nodes."""
+
+    def __init__(self, discretisation: Discretisation, basis: LinearBasis) -> None:
+        self.groups, self.nodes = discretisation.groups, discretisation.nodes
+        tables: list[_Tables] = []
+        for group in self.groups:
+            expression = ConstrainedExpression(
+                basis.beyond(2 * group.order),
+                hermite(group.order),
+                nodes=self.nodes,
+                order=group.order,
+                conditioning=discretisation.conditioning,
+                dtype=self.nodes.points.dtype,
+                device=self.nodes.points.device,
+            )
+            B = _free(group, expression.tables(self.nodes.points, group.order)[0])
+            both = torch.cat([B, group.Omega], -1).movedim(-1, 0).flatten(1)
+            start = tables[-1].own.stop if tables else 0
+            tables.append(_Tables(expression, B, both, slice(start, start + group.n_chains * B.shape[-1])))
+        self.tables = tuple(tables)
+        self.output_layer = torch.arange(self.n_own, device=self.nodes.points.device)
+
+    @property
+    def n_own(self) -> int:
+        return self.tables[-1].own.stop
+
+    def beta(self, group: int, weights: Tensor) -> Tensor:
+        """β (..., d, L) of a group's chains, a view of weights (..., n_own)."""
+        return weights[..., self.tables[group].own].unflatten(-1, (self.groups[group].n_chains, -1))
+
+    def jets(self, weights: Tensor, kappas: Sequence[Tensor]) -> list[Tensor]:
+        out = []
+        for i, kappa in enumerate(kappas):
+            jet = torch.cat([self.beta(i, weights), kappa], -1) @ self.tables[i].both
+            out.append(jet.unflatten(-1, (self.groups[i].order + 1, -1)))
+        return out
+
+    def jets_at(self, z: Tensor, weights: Tensor, kappas: Sequence[Tensor]) -> list[Tensor]:
+        out = []
+        for i, (group, kappa) in enumerate(zip(self.groups, kappas, strict=True)):
+            free, known = self.tables[i].expression.tables(z, group.order)
+            table, both = torch.cat([_free(group, free), known], -1), torch.cat([self.beta(i, weights), kappa], -1)
+            out.append(torch.einsum("omk,...dk->...dom", table, both))
+        return out
+
+    def pull_back(self, weights: Tensor, cotangents: Cotangents) -> Tensor:
+        n_rows = self.groups[-1].rows.stop
+        local = weights.new_zeros(*weights.shape[:-1], n_rows, self.n_own)
+        for (i, j), by_order in cotangents.items():
+            group, table = self.groups[i], self.tables[j]
+            shape = (group.n_chains, -1, self.groups[j].n_chains, table.size)
+            block = local[..., group.rows, table.own].unflatten(-1, shape[2:]).unflatten(-3, shape[:2])
+            for e, c in by_order.items():
+                if group.pointwise is not None:
+                    block.addcmul_(c.unsqueeze(-1), table.B[e].unsqueeze(-2))
+                else:
+                    product = group.test @ (c.unsqueeze(-1) * table.B[e].unsqueeze(-2)).flatten(-2)
+                    block.add_(product.unflatten(-1, shape[2:]))
+            if i == j:
+                block.diagonal(dim1=-4, dim2=-2).add_((group.test @ table.B[-1]).unsqueeze(-1))
+        return local
+
+    def fit(self, values: Sequence[Tensor], kappas: Sequence[Tensor]) -> Tensor:
+        weights = values[0].new_zeros(*values[0].shape[:-2], self.n_own)
+        nodes = self.nodes
+        for i, group in enumerate(self.groups):
+            if not group.trivial:
+                fitted = self.tables[i].expression.fit(
+                    nodes.points, values[i], kappas[i].mT, weights=nodes.weights, ridge=1e-18
+                )
+                self.beta(i, weights).copy_(fitted.mT)
+        return weights
+
+
+def _free(group: Group, table: Tensor) -> Tensor:
+    """A trivial chain is its Hermite interpolant: no free function."""
+    return table[..., :0] if group.trivial else table
