@@ -1,4 +1,4 @@
-"""Linear free functions g(z) = sum_l w_l phi_l(z) with exact derivatives of any order.
+"""Free functions: those linear in their weights, g(z) = sum_l w_l phi_l(z), with exact derivatives of any order.
 
 A basis holds the architecture only; its output weights are arguments, so segments and samples can be batched.
 """
@@ -16,7 +16,16 @@ from torch import Tensor, nn
 from ponn_torch.numerics.nodes import differentiation_matrix, interpolation_matrix
 
 
-class LinearBasis(nn.Module, ABC):
+class FreeFunction(nn.Module, ABC):
+    """A function g of z whose weights are an argument: linear in them (a basis) or not (a network)."""
+
+    @property
+    @abstractmethod
+    def arguments(self) -> dict[str, Any]:
+        """What the class is called with, in JSON's types, to make this function again up to its buffers."""
+
+
+class LinearBasis(FreeFunction):
     """`size` functions phi_l, tabulated with their derivatives by `features`."""
 
     size: int
@@ -29,7 +38,6 @@ class LinearBasis(nn.Module, ABC):
 
     @property
     def arguments(self) -> dict[str, Any]:
-        """What the class is called with, in JSON's types, to make this basis again up to its buffers."""
         return {"size": self.size}
 
     @abstractmethod
@@ -130,16 +138,43 @@ def _gaussian(u: Tensor, order: int) -> Tensor:
     return torch.stack(derivatives)
 
 
+def _gated(gate: Callable[[Tensor, int], Tensor]) -> Callable[[Tensor, int], Tensor]:
+    """u gate(u); Leibniz: (u g)^(e) = u g^(e) + e g^(e-1)."""
+
+    def activation(u: Tensor, order: int) -> Tensor:
+        stack = gate(u, order)
+        counts = torch.arange(1, order + 1, dtype=u.dtype, device=u.device).view(-1, *[1] * u.dim())
+        return torch.cat([u * stack[:1], u * stack[1:] + counts * stack[:-1]])
+
+    return activation
+
+
+def _normal(u: Tensor, order: int) -> Tensor:
+    # the normal distribution, whose slope is a Gaussian of u/√2
+    halves = torch.tensor([2.0 ** (-e / 2) for e in range(order + 1)], dtype=u.dtype, device=u.device)
+    density = _gaussian(u / 2**0.5, order) * (halves / (2 * np.pi) ** 0.5).view(-1, *[1] * u.dim())
+    return torch.cat([torch.special.ndtr(u)[None], density[:-1]])
+
+
 ACTIVATIONS: dict[str, Callable[[Tensor, int], Tensor]] = {  # (u, order) -> (order+1, *u.shape)
     "tanh": _tanh,
     "sin": _sin,
     "sigmoid": _sigmoid,
     "gaussian": _gaussian,
+    "gelu": _gated(_normal),
+    "silu": _gated(_sigmoid),
 }
 
 # Slopes up to these resolve smooth functions on [-1, 1] with 30 to 80 units (measured on second derivatives);
 # flatter units are nearly dependent, steeper ones leave gaps.
-DEFAULT_SLOPES: dict[str, float] = {"tanh": 6.0, "sin": 24.0, "sigmoid": 12.0, "gaussian": 9.0}
+DEFAULT_SLOPES: dict[str, float] = {
+    "tanh": 6.0,
+    "sin": 24.0,
+    "sigmoid": 12.0,
+    "gaussian": 9.0,
+    "gelu": 9.0,
+    "silu": 12.0,
+}
 
 
 def _powers(slopes: Tensor, order: int) -> Tensor:

@@ -6,6 +6,7 @@ import torch
 from torch.func import jacfwd, vmap
 
 from ponn_torch.ansatz.basis import ACTIVATIONS, Chebyshev, GaussianRBF, Lagrange, Legendre, RandomFeatures
+from ponn_torch.ansatz.networks import FrozenMLP
 
 BASES = {
     "chebyshev": lambda: Chebyshev(9),
@@ -16,6 +17,7 @@ BASES = {
     "tanh, independent biases": lambda: RandomFeatures(6, "tanh", weight_range=(-1.0, 1.0), bias_range=(-1.0, 1.0)),
     "rbf": lambda: GaussianRBF(5, 1.5),
     "rbf, own shapes": lambda: GaussianRBF([-0.8, 0.1, 0.9], [0.5, 1.0, 2.0]),
+    "frozen network": lambda: FrozenMLP((5, 6), seed=3),
 }
 Z = torch.tensor([-1.0, -0.63, -0.1, 0.0, 0.4, 0.99, 1.0], dtype=torch.float64)
 
@@ -112,7 +114,10 @@ def test_activations_are_what_their_names_say():
         "sin": torch.sin,
         "sigmoid": torch.sigmoid,
         "gaussian": lambda u: (-u * u).exp(),
+        "gelu": torch.nn.functional.gelu,
+        "silu": torch.nn.functional.silu,
     }
+    assert set(expected) == set(ACTIVATIONS)
     u = torch.linspace(-30, 30, 61, dtype=torch.float64)
     for name, function in expected.items():
         stack = ACTIVATIONS[name](u, 4)
