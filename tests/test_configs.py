@@ -171,7 +171,8 @@ def test_config_solves_with_a_tiny_budget(
     outcome = run(composed(tiny(group, option)), tmp_path, tiny(group, option))
     assert outcome.exit_code in (0, 2), outcome.message
     assert outcome.cost is not None
-    assert outcome.cost > 0
+    assert math.isfinite(outcome.cost)
+    assert outcome.cost > 0 or option == "orbit_raising"  # which maximises
     assert not outcome.certified
     assert outcome.score == math.inf
     assert (tmp_path / "solution" / "solution.json").is_file()

@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
+NUMERALS = {2: "two", 3: "three"}
+
 
 def check_positive(**values: float) -> None:
     """Raise a ValueError for the first value that is not a positive, finite number."""
@@ -13,11 +15,11 @@ def check_positive(**values: float) -> None:
             raise ValueError(f"{name} = {value}; allowed: a positive number")
 
 
-def check_vectors(**values: Sequence[float]) -> None:
-    """Raise a ValueError for the first value that is not three finite numbers."""
+def check_vectors(size: int = 3, /, **values: Sequence[float]) -> None:
+    """Raise a ValueError for the first value that is not ``size`` finite numbers."""
     for name, value in values.items():
-        if len(value) != 3 or not all(math.isfinite(entry) for entry in value):
-            raise ValueError(f"{name} = {list(value)}; allowed: three numbers")
+        if len(value) != size or not all(math.isfinite(entry) for entry in value):
+            raise ValueError(f"{name} = {list(value)}; allowed: {NUMERALS[size]} numbers")
 
 
 def check_thrust(minimum_thrust: float, maximum_thrust: float) -> None:

@@ -127,9 +127,46 @@ def boundary_layer(x, c) -> Rates:
     }
 
 
+def zermelo(x, c) -> Rates:
+    size = torch.hypot(c.x, c.y)
+    return {
+        "x": -c.x / size - x.y,
+        "y": -c.y / size,
+        "lambda_x": torch.zeros_like(c.x),
+        "lambda_y": c.x,
+    }
+
+
+def brachistochrone(x, c) -> Rates:
+    along, down = c.x * x.v, c.y * x.v + c.v * G0
+    size = torch.hypot(along, down)
+    return {
+        "x": -x.v * along / size,
+        "y": -x.v * down / size,
+        "v": -G0 * down / size,
+        "lambda_x": torch.zeros_like(c.x),
+        "lambda_y": torch.zeros_like(c.y),
+        "lambda_v": (c.x * along + c.y * down) / size,
+    }
+
+
+def orbit_raising(x, c) -> Rates:
+    """At t = 0, with vr = u and vt = v of Bryson and Ho, section 2.5."""
+    size = torch.hypot(c.vr, c.vt) / 0.1405
+    return {
+        "r": x.vr,
+        "vr": x.vt**2 / x.r - 1 / x.r**2 - c.vr / size,
+        "vt": -x.vr * x.vt / x.r - c.vt / size,
+        "lambda_r": c.vr * (x.vt**2 / x.r**2 - 2 / x.r**3) - c.vt * x.vr * x.vt / x.r**2,
+        "lambda_vr": -c.r + c.vt * x.vt / x.r,
+        "lambda_vt": -2 * c.vr * x.vt / x.r + c.vt * x.vr / x.r,
+    }
+
+
 CANTED = 1 / (225.0 * G0 * math.cos(math.radians(27.0)))
 BY_HAND: dict[str, Callable[..., Rates]] = {
     "boundary_layer": boundary_layer,
+    "brachistochrone": brachistochrone,
     "minimum_energy": double_integrator(lambda costate: -costate),
     # S = −λv (u_max − u_min) in units of H
     "minimum_time": double_integrator(lambda costate: torch.tanh(-2 * costate / RHO)),
@@ -141,7 +178,9 @@ BY_HAND: dict[str, Callable[..., Rates]] = {
     "energy_transfer": energy_transfer,
     "energy_transfer_limited": energy_transfer_limited,
     "mars_landing": landing(CANTED),
+    "orbit_raising": orbit_raising,
     "small_body_landing": small_body(linearised_gravity),
+    "zermelo": zermelo,
     "tfc_test_1": landing(5.0863e-4),
     "tfc_test_2": landing(5.0863e-4),
     "small_body_point_mass": small_body(lambda r, costate: central(4.46311e5, r, costate)),

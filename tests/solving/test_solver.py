@@ -58,6 +58,11 @@ ANSWERS = {
     "minimum_fuel": Answer(
         3 - math.sqrt(5), 1e-12, ("max", "min", "max"), (1.5 - math.sqrt(1.25), 1.5 + math.sqrt(1.25)), 1e-12
     ),
+    "brachistochrone": Answer(1.80160312245308, 1e-12, final_time=1.80160312245308, hamiltonian=0.0),
+    "orbit_raising": Answer(
+        -1.525064001468, 1e-11, costates={"r": (-1.87712491,), "vr": (-0.92898546,), "vt": (-2.02464937,)}
+    ),
+    "zermelo": Answer(5.457865263560512, 1e-12, final_time=5.457865263560512, hamiltonian=0.0),
     "earth_mars": Answer(
         396.05984393,
         1e-7,
