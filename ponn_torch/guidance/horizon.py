@@ -203,51 +203,51 @@ class FactoredHorizon:
     def solve(self, problem: LinearTPBVP) -> HorizonSolution:
         """For a problem that differs from the factored one in initial state, terminal offset and drift only."""
         right = self.solver.right_side(problem)
-        solution = self.eliminate(right.unsqueeze(-1)).squeeze(-1)
+        if self.matrix.dim() == 2:  # one matrix: a batch is so many right-hand sides
+            solution = self.eliminate(right.reshape(-1, right.shape[-1]).mT).mT.reshape(*right.shape[:-1], -1)
+        else:
+            solution = self.eliminate(right.unsqueeze(-1)).squeeze(-1)
         coefficients = solution.unflatten(-1, (self.solver.basis.size, 2 * problem.n_states))
         return HorizonSolution(self.solver, problem, coefficients, self.matrix, right)
 
     def affine(self) -> AffineHorizon:
-        """The solution as an affine function of x0, by n + 1 right-hand sides."""
-        problem, n = self.problem, self.problem.n_states
-        given = problem.initial
-        zero = self.solver.right_side(replace(problem, initial=torch.zeros_like(given)))
-        units = torch.eye(n, dtype=given.dtype, device=given.device)
-        columns = [self.solver.right_side(replace(problem, initial=unit.expand_as(given))) - zero for unit in units]
-        solution = self.eliminate(torch.stack([*columns, zero], dim=-1))
-        size = (self.solver.basis.size, 2 * n)
-        gain, constant = solution[..., :-1], solution[..., -1]
-        return AffineHorizon(self.solver, problem, gain.unflatten(-2, size), constant.unflatten(-1, size))
+        """The solution as an affine function of x0 about the problem's own, by n + 1 right-hand sides."""
+        solver, problem, n = self.solver, self.problem, self.problem.n_states
+        linear = replace(problem, drift=torch.zeros_like(problem.drift), terminal_offset=None)
+        units = torch.eye(n, dtype=problem.initial.dtype, device=problem.initial.device)
+        columns = [solver.right_side(replace(linear, initial=unit.expand_as(problem.initial))) for unit in units]
+        solution = self.eliminate(torch.stack([*columns, solver.right_side(problem)], dim=-1))
+        size = (solver.basis.size, 2 * n)
+        return AffineHorizon(
+            solver, problem, solution[..., :-1].unflatten(-2, size), solution[..., -1].unflatten(-1, size)
+        )
 
 
 @dataclass(frozen=True, eq=False)
 class AffineHorizon:
-    """Coefficients gain x0 + constant: one factorisation for any number of vehicles, two products a solve.
+    """Coefficients about + gain (x0 − x̄0): one factorisation for any number of vehicles, two products a solve.
 
-    gain: (..., L, 2n, n). constant: (..., L, 2n).
+    problem: the one solved, with x̄0; near it few digits are lost. gain: (..., L, 2n, n). about: (..., L, 2n).
     """
 
     solver: HorizonSolver
     problem: LinearTPBVP
     gain: Tensor
-    constant: Tensor
+    about: Tensor
 
     def coefficients(self, initial: Tensor) -> Tensor:
         """(..., V, L, 2n) for V vehicles x0 (..., V, n)."""
-        flat = initial @ self.gain.flatten(-3, -2).mT + self.constant.flatten(-2).unsqueeze(-2)
-        return flat.unflatten(-1, self.constant.shape[-2:])
+        change = initial - self.problem.initial.unsqueeze(-2)
+        flat = change @ self.gain.flatten(-3, -2).mT + self.about.flatten(-2).unsqueeze(-2)
+        return flat.unflatten(-1, self.about.shape[-2:])
 
     def values(self, z: Tensor) -> tuple[Tensor, Tensor]:
-        """y at z (m,) as (matrix (..., m, 2n, n), offset (..., m, 2n)): y = matrix x0 + offset."""
+        """y at z (m,) as (matrix (..., m, 2n, n), offset (..., m, 2n)): y = offset + matrix (x0 − x̄0)."""
         problem, solver = self.problem, self.solver
+        linear = replace(problem, terminal_offset=None)
         units = torch.eye(problem.n_states, dtype=self.gain.dtype, device=self.gain.device)
-        zero = torch.zeros_like(units[0])
-        offset = solver.values(self.constant, replace(problem, initial=zero), z)
-        columns = [
-            solver.values(self.gain[..., j] + self.constant, replace(problem, initial=unit), z) - offset
-            for j, unit in enumerate(units)
-        ]
-        return torch.stack(columns, dim=-1), offset
+        columns = [solver.values(self.gain[..., j], replace(linear, initial=e), z) for j, e in enumerate(units)]
+        return torch.stack(columns, dim=-1), solver.values(self.about, problem, z)
 
 
 @dataclass(frozen=True, eq=False)
