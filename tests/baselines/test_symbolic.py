@@ -1,0 +1,63 @@
+"""Torch functions as CasADi expressions: the same values, exact derivatives, and errors that say what is missing."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from ponn_torch.baselines.symbolic import evaluate, load_casadi
+
+casadi = pytest.importorskip("casadi")
+
+MATRIX = [[1.0, 2.0, -1.0], [0.5, 0.0, 3.0], [-2.0, 1.0, 1.0]]
+FUNCTIONS: dict[str, Callable[[Tensor], Tensor]] = {
+    "gravity": lambda x: -x / torch.sqrt((x * x).sum(-1, keepdim=True)) ** 3,
+    "norm": lambda x: x / x.norm(dim=-1, keepdim=True),
+    "matrix": lambda x: x @ x.new_tensor(MATRIX),
+    "matrix from the left": lambda x: torch.einsum("ij,...j->...i", x.new_tensor(MATRIX), x),
+    "cross": lambda x: torch.stack([x[..., 1], -x[..., 0], torch.zeros_like(x[..., 0])], -1),
+    "slices": lambda x: torch.cat([x[..., 1:], 2.0 - x[..., :1], x.new_zeros(*x.shape[:-1], 1)], -1),
+    "angles": lambda x: torch.atan2(torch.sin(x), torch.cos(x)) + torch.tan(x) * torch.tanh(x),
+    "exponentials": lambda x: torch.exp(-x) + torch.log(x) + torch.log1p(x) + torch.sigmoid(x) + torch.expm1(x),
+    "choices": lambda x: torch.where(x > 1.0, x**2, x.clamp(0.8, 1.2)) + torch.minimum(x, 1.0 / x).abs(),
+    "mean": lambda x: (x - x.mean(-1, keepdim=True)).square() + torch.rsqrt(x),
+    "full": lambda x: torch.full_like(x, 3.0) * torch.ones_like(x) - torch.hypot(x, x.new_tensor(2.0)),
+}
+
+
+def as_function(function: Callable[[Tensor], Tensor]) -> object:
+    symbol = casadi.SX.sym("x", 3)
+    values = evaluate(function, np.array([[symbol[i] for i in range(3)]], dtype=object))
+    return casadi.Function("f", [symbol], [casadi.vertcat(*values.ravel())])
+
+
+@pytest.mark.parametrize("name", FUNCTIONS)
+def test_values_and_derivatives_are_those_of_torch(name: str) -> None:
+    function, x = FUNCTIONS[name], torch.tensor([[0.7, 1.3, 0.4]], dtype=torch.float64)
+    symbolic = as_function(function)
+    found = np.asarray(symbolic(x[0].numpy())).ravel()
+    np.testing.assert_allclose(found, function(x)[0].numpy(), rtol=1e-14, atol=1e-15)
+    jacobian = torch.func.jacrev(lambda v: function(v[None])[0])(x[0])
+    by_casadi = np.asarray(symbolic.jacobian()(x[0].numpy(), 0.0))
+    np.testing.assert_allclose(by_casadi, jacobian.numpy(), rtol=1e-13, atol=1e-14)
+
+
+def test_an_unknown_operation_is_named() -> None:
+    with pytest.raises(ValueError, match="counterpart of torch operation 'erfinv'"):
+        as_function(torch.erfinv)
+
+
+def test_a_choice_by_data_is_refused() -> None:
+    with pytest.raises(ValueError, match="cannot be traced"):
+        as_function(lambda x: x if bool(x.sum() > 1.0) else -x)
+
+
+def test_without_casadi_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "casadi", None)
+    with pytest.raises(ImportError, match=r"pip install ponn-torch\[baselines\]"):
+        load_casadi()
