@@ -181,7 +181,7 @@ class Program:
         states, controls = ca.MX.sym("x", n, n_nodes + 1), ca.MX.sym("nu", m, n_nodes)
         counts = [phase.n_segments for phase in self.phases]
 
-        def constant(matrix: Array) -> Any:
+        def constant(matrix: Any) -> Any:
             return ca.sparsify(ca.DM(matrix))
 
         spread = constant(np.repeat(np.eye(len(counts)) / np.array(counts), counts, axis=0))
