@@ -163,6 +163,17 @@ def orbit_raising(x, c) -> Rates:
     }
 
 
+def energy_landing(x, c) -> Rates:
+    down = x.v.new_tensor([0.0, 0.0, -3.7114])
+    return {"r": x.v, "v": down - c.v, "lambda_r": torch.zeros_like(c.r), "lambda_v": -c.r}
+
+
+def oscillator(x, c) -> Rates:
+    force = -torch.tanh(2 * c.z / RHO)
+    turned = torch.stack([c.z[..., 1], -c.z[..., 0]], -1)
+    return {"z": torch.stack([x.z[..., 1], -x.z[..., 0]], -1) + force, "lambda_z": turned}
+
+
 CANTED = 1 / (225.0 * G0 * math.cos(math.radians(27.0)))
 BY_HAND: dict[str, Callable[..., Rates]] = {
     "boundary_layer": boundary_layer,
@@ -175,10 +186,12 @@ BY_HAND: dict[str, Callable[..., Rates]] = {
     ),
     "earth_mars": earth_mars,
     "earth_mars_minimum_time": earth_mars_minimum_time,
+    "energy_landing": energy_landing,
     "energy_transfer": energy_transfer,
     "energy_transfer_limited": energy_transfer_limited,
     "mars_landing": landing(CANTED),
     "orbit_raising": orbit_raising,
+    "oscillator": oscillator,
     "small_body_landing": small_body(linearised_gravity),
     "zermelo": zermelo,
     "tfc_test_1": landing(5.0863e-4),

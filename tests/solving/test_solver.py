@@ -59,6 +59,16 @@ ANSWERS = {
         3 - math.sqrt(5), 1e-12, ("max", "min", "max"), (1.5 - math.sqrt(1.25), 1.5 + math.sqrt(1.25)), 1e-12
     ),
     "brachistochrone": Answer(1.80160312245308, 1e-12, final_time=1.80160312245308, hamiltonian=0.0),
+    "energy_landing": Answer(966.6594929655195, 1e-9, final_time=48.15952987, hamiltonian=0.0),
+    "oscillator": Answer(
+        2.8613463025446273,
+        1e-12,
+        ("min,min", "min,max", "max,max"),
+        (0.5936556554962977, 2.1644519822911943),
+        1e-11,
+        2.8613463025446273,
+        hamiltonian=0.0,
+    ),
     "orbit_raising": Answer(
         -1.525064001468, 1e-11, costates={"r": (-1.87712491,), "vr": (-0.92898546,), "vt": (-2.02464937,)}
     ),
@@ -125,7 +135,7 @@ def test_every_published_answer_is_asked_for():
 
 @cache
 def solved(name: str, seed: int = 0) -> SolveResult:
-    guess = PolarTransfer() if name.startswith("energy") else RandomGuess()
+    guess = PolarTransfer() if name.startswith("energy_transfer") else RandomGuess()
     return Solver(guess=guess).solve(problem(name), seed)
 
 
@@ -177,7 +187,7 @@ def test_every_random_start_ends_in_the_optimum(name, seed):
 @pytest.mark.parametrize("mass_variable", ["mass", "delta_v"])
 @pytest.mark.parametrize("name", [name for name in ANSWERS if problem(name).mass is not None])
 def test_every_mass_variable_finds_the_optimum(name, mass_variable):
-    guess = PolarTransfer() if name.startswith("energy") else RandomGuess()
+    guess = PolarTransfer() if name.startswith("energy_transfer") else RandomGuess()
     result = Solver(guess=guess, mass_variable=mass_variable).solve(problem(name))
     assert result.certified, result.message
     assert result.solution.cost == pytest.approx(ANSWERS[name].cost, abs=10 * ANSWERS[name].tolerance)
