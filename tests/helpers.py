@@ -6,6 +6,7 @@ import importlib
 import inspect
 import pkgutil
 from collections.abc import Callable
+from dataclasses import replace
 from functools import cache
 
 import torch
@@ -15,7 +16,10 @@ import ponn_torch.problems
 from ponn_torch.ansatz.basis import Chebyshev, GaussianRBF, Legendre, LinearBasis, RandomFeatures
 from ponn_torch.numerics.nodes import make_nodes
 from ponn_torch.optim.base import Optimizer, Stopping
+from ponn_torch.optim.chain import Chain
+from ponn_torch.optim.gradient import Adam
 from ponn_torch.optim.least_squares import GaussNewton, LevenbergMarquardt, ScipyLeastSquares
+from ponn_torch.optim.quasi_newton import LBFGS, SSBroyden
 from ponn_torch.optimal_control.collocation import Collocation
 from ponn_torch.optimal_control.discretisation import Discretisation, Form, Strong
 from ponn_torch.optimal_control.pontryagin import BoundaryValueProblem, pontryagin
@@ -31,6 +35,9 @@ OPTIMIZERS: dict[str, Callable[[Stopping], Optimizer]] = {
     "gauss_newton": GaussNewton,
     "scipy_trf": lambda stopping: ScipyLeastSquares("trf", stopping),
     "scipy_lm": lambda stopping: ScipyLeastSquares("lm", stopping),
+    "lbfgs": LBFGS,
+    "ssbroyden": SSBroyden,
+    "adam_lm": lambda stopping: Chain([Adam(replace(stopping, max_iterations=20)), LevenbergMarquardt(stopping)]),
 }
 
 # -- free functions ------------------------------------------------------------------------------------------

@@ -6,12 +6,15 @@ import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from enum import Enum
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import torch
 from torch import Tensor
 
 from ponn_torch.numerics.linalg import Jacobian
+
+if TYPE_CHECKING:
+    from ponn_torch.optim.checkpoint import Checkpoint
 
 
 class Status(Enum):
@@ -22,8 +25,10 @@ class Status(Enum):
     SMALL_DECREASE = "the relative decrease stayed below its tolerance for several steps"
     SMALL_STEP = "the relative step fell below its tolerance"
     DAMPING = "no step decreased the residual up to the largest damping"
+    LINE_SEARCH = "no step along the search direction decreased the residual"
     MAX_ITERATIONS = "the iteration limit was reached"
     TIME_LIMIT = "the CPU time limit was reached"
+    BUDGET = "the CPU time of the whole run was spent"
     HOPELESS = "the residual was still above the limit that tells a failed start"
     NON_FINITE = "the residual or its Jacobian is not finite at the best point"
     INTERRUPTED = "interrupted from the keyboard"
@@ -34,7 +39,14 @@ class Status(Enum):
         return self in _STATIONARY
 
 
-_STATIONARY = {Status.RESIDUAL, Status.ROUND_OFF, Status.SMALL_DECREASE, Status.SMALL_STEP, Status.DAMPING}
+_STATIONARY = {
+    Status.RESIDUAL,
+    Status.ROUND_OFF,
+    Status.SMALL_DECREASE,
+    Status.SMALL_STEP,
+    Status.DAMPING,
+    Status.LINE_SEARCH,
+}
 
 
 class Residual(Protocol):
@@ -94,7 +106,15 @@ class OptimizeResult:
 
 
 class Optimizer(Protocol):
-    def run(self, residual: Residual, xi: Tensor, on_iteration: Callback | None = None) -> OptimizeResult: ...
+    def run(
+        self,
+        residual: Residual,
+        xi: Tensor,
+        on_iteration: Callback | None = None,
+        checkpoint: Checkpoint | None = None,
+    ) -> OptimizeResult:
+        """Minimise ½‖r(ξ)‖² from ξ, or go on from where the checkpoint stands; never raises for want of convergence."""
+        ...
 
 
 class NonFiniteResidual(FloatingPointError):
@@ -115,6 +135,14 @@ def check_start(residual: Residual, value: Tensor) -> Tensor:
         f"the residual is not finite at the starting point, in the equations of: {', '.join(bad)}; "
         "start from a point where the dynamics are defined (other seed, distribution or guess)"
     )
+
+
+class Stop(Exception):
+    """Raised by a callback to end the run that called it; the best point is kept and the status is this one."""
+
+    def __init__(self, status: Status) -> None:
+        super().__init__(status.value)
+        self.status = status
 
 
 class Stopwatch:

@@ -6,7 +6,7 @@ have ended are frozen. A trial step costs one residual; the Jacobian is formed a
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import torch
@@ -20,18 +20,14 @@ from ponn_torch.optim.base import (
     Record,
     Residual,
     Status,
+    Stop,
     Stopping,
     Stopwatch,
     check_start,
     record,
 )
-
-_RUNNING = -1
-_CODES = list(Status)
-
-
-def _code(status: Status) -> int:
-    return _CODES.index(status)
+from ponn_torch.optim.checkpoint import Arrays, Checkpoint
+from ponn_torch.optim.driver import Counted, Move, drive, restored
 
 
 def _check_solver(linear_solver: str) -> None:
@@ -64,6 +60,19 @@ SCALINGS = {"marquardt": marquardt, "more": more, "identity": identity}
 
 
 @dataclass(frozen=True)
+class DampedState:
+    """Where Levenberg–Marquardt stands: ξ, r there, D, μ and its growth, and (r, J) if a rejected step left it."""
+
+    xi: Tensor
+    r: Tensor
+    scale: Tensor
+    damping: Tensor
+    growth: Tensor
+    formed: bool = False
+    linear: tuple[Tensor, Jacobian] | None = None
+
+
+@dataclass(frozen=True)
 class LevenbergMarquardt:
     """Damped Gauss–Newton: ``scaling`` chooses D, Nielsen's rule moves μ, a step is taken only if ‖r‖ falls.
 
@@ -90,95 +99,69 @@ class LevenbergMarquardt:
         if not self.damping >= 0:
             raise ValueError(f"damping = {self.damping}; allowed: a number ≥ 0")
 
-    def run(self, residual: Residual, xi: Tensor, on_iteration: Callback | None = None) -> OptimizeResult:
+    def run(
+        self,
+        residual: Residual,
+        xi: Tensor,
+        on_iteration: Callback | None = None,
+        checkpoint: Checkpoint | None = None,
+    ) -> OptimizeResult:
         """Minimise ½‖r(ξ)‖² from ξ (..., N).
 
         Raises:
             NonFiniteResidual: r is not finite at the start, in no member of the batch; alone, a member has failed.
         """
-        rule, watch = self.stopping, Stopwatch()
+        return drive(self, residual, xi, on_iteration, checkpoint)
+
+    def begin(self, residual: Counted, xi: Tensor) -> DampedState:
         r, jacobian = residual.linearise(xi)
-        finite = check_start(residual, r)
         cost = r.square().sum(-1)
-        scale = self._scale(jacobian, None)
-        damping = torch.full_like(cost, self.damping)
-        growth = torch.full_like(cost, 2.0)
-        code = torch.where(finite, _RUNNING, _code(Status.NON_FINITE))
-        slow = torch.zeros_like(code)
-        records: list[Record] = []
-        n_residuals, n_linear, tiny = 0, 1, torch.finfo(cost.dtype).tiny
-        if not rule.past_tolerance:
-            code = torch.where(cost.sqrt() < rule.tolerance, _code(Status.RESIDUAL), code)
-        interrupted = False
-        while bool((code == _RUNNING).any()):
-            try:
-                step = jacobian.solve_damped(r, damping, scale, self.linear_solver)
-                trial = xi + step
-                trial_r = residual.residual(trial)
-                n_residuals += 1
-                running = code == _RUNNING
-                trial_cost = trial_r.square().sum(-1)
-                accepted = running & (trial_cost < cost)  # NaN compares false: a non-finite step is rejected
-                # ‖r‖² − ‖r + J p‖² for the exact solution of the damped system
-                predicted = (step * (damping.unsqueeze(-1) * scale.square() * step - jacobian.gradient(r))).sum(-1)
-                gain = (cost - trial_cost) / predicted.clamp_min(tiny)
-                damping, growth = self._update(damping, growth, gain, accepted, running)
-                # a rejected step that promised next to nothing is as good as a small decrease: round-off is near
-                relative = torch.where(accepted, cost - trial_cost, predicted) / cost
-                step_norm = (scale * step).norm(dim=-1) / (scale * xi).norm(dim=-1).clamp_min(tiny)
-                rises = running & ~accepted & (cost.sqrt() < rule.tolerance)
-                if bool(accepted.any()):
-                    xi = torch.where(accepted.unsqueeze(-1), trial, xi)
-                    cost = torch.where(accepted, trial_cost, cost)
-                slow = torch.where(relative < rule.decrease, slow + 1, torch.where(accepted, 0, slow))
-                norm = cost.sqrt()
-                met = (norm < rule.tolerance) & (not rule.past_tolerance)
-                iteration = len(records) + 1
-                records.append(
-                    record(
-                        iteration=iteration,
-                        norm=norm.nanmedian() if norm.dim() else norm,
-                        damping=damping.nanmedian() if norm.dim() else damping,
-                        step=step_norm.nanmedian() if norm.dim() else step_norm,
-                        accepted=accepted.any(),
-                        running=int(running.sum()),
-                        residuals=n_residuals,
-                        linearisations=n_linear,
-                        seconds=watch.seconds,
-                    )
-                )
-                if on_iteration is not None:
-                    on_iteration(records[-1], xi, torch.where(accepted.unsqueeze(-1), trial_r, r))
-                for condition, status in (
-                    (met, Status.RESIDUAL),
-                    (rises & rule.past_tolerance, Status.ROUND_OFF),
-                    (slow >= rule.patience, Status.SMALL_DECREASE),
-                    (accepted & (step_norm < rule.step), Status.SMALL_STEP),
-                    (~torch.isfinite(scale).all(-1), Status.NON_FINITE),
-                    (~accepted & (damping >= self.largest_damping), Status.DAMPING),
-                    ((norm > rule.hopeless) & (iteration >= rule.hopeless_after), Status.HOPELESS),
-                    (torch.tensor(iteration >= rule.max_iterations), Status.MAX_ITERATIONS),
-                    (torch.tensor(watch.seconds > rule.cpu_seconds), Status.TIME_LIMIT),
-                ):
-                    code = torch.where((code == _RUNNING) & condition, _code(status), code)
-                if bool(accepted.any()) and bool((code == _RUNNING).any()):
-                    r, jacobian = residual.linearise(xi)
-                    n_linear += 1
-                    scale = self._scale(jacobian, scale)
-            except KeyboardInterrupt:
-                interrupted = True
-                break
-        members = tuple(Status.INTERRUPTED if c == _RUNNING else _CODES[c] for c in code.flatten().tolist())
-        return OptimizeResult(
+        return DampedState(
             xi=xi,
-            norm=cost.sqrt(),
-            status=Status.INTERRUPTED if interrupted else _common(members),
-            records=records,
-            n_residuals=n_residuals,
-            n_linearisations=n_linear,
-            cpu_seconds=watch.seconds,
-            member_status=members,
+            r=r,
+            scale=self._scale(jacobian, None),
+            damping=torch.full_like(cost, self.damping),
+            growth=torch.full_like(cost, 2.0),
+            formed=True,
+            linear=(r, jacobian),
         )
+
+    def restore(self, residual: Counted, arrays: Arrays, like: Tensor) -> DampedState:
+        state: DampedState = restored(DampedState, arrays, like)
+        return replace(state, linear=residual.linearise(state.xi)) if state.formed else state
+
+    def step(self, residual: Counted, state: DampedState, running: Tensor) -> tuple[DampedState, Move]:
+        xi, scale, damping, growth = state.xi, state.scale, state.damping, state.growth
+        if state.linear is not None:
+            r, jacobian = state.linear
+        else:
+            r, jacobian = residual.linearise(xi)
+            scale = self._scale(jacobian, scale)
+        cost, tiny = state.r.square().sum(-1), torch.finfo(xi.dtype).tiny
+        step = jacobian.solve_damped(r, damping, scale, self.linear_solver)
+        trial = xi + step
+        trial_r = residual.residual(trial)
+        trial_cost = trial_r.square().sum(-1)
+        accepted = running & (trial_cost < cost)  # NaN compares false: a non-finite step is rejected
+        # ‖r‖² − ‖r + J p‖² for the exact solution of the damped system
+        predicted = (step * (damping.unsqueeze(-1) * scale.square() * step - jacobian.gradient(r))).sum(-1)
+        gain = (cost - trial_cost) / predicted.clamp_min(tiny)
+        damping, growth = self._update(damping, growth, gain, accepted, running)
+        move = Move(
+            # a rejected step that promised next to nothing is as good as a small decrease: round-off is near
+            decrease=torch.where(accepted, cost - trial_cost, predicted) / cost,
+            step=(scale * step).norm(dim=-1) / (scale * xi).norm(dim=-1).clamp_min(tiny),
+            damping=damping,
+            ended={
+                Status.NON_FINITE: ~torch.isfinite(scale).all(-1),
+                Status.DAMPING: ~accepted & (damping >= self.largest_damping),
+            },
+        )
+        if not bool(accepted.any()):
+            return DampedState(xi, state.r, scale, damping, growth, True, (r, jacobian)), move
+        where = accepted.unsqueeze(-1)
+        xi, trial_r = torch.where(where, trial, xi), torch.where(where, trial_r, state.r)
+        return DampedState(xi, trial_r, scale, damping, growth), move
 
     def _scale(self, jacobian: Jacobian, previous: Tensor | None) -> Tensor:
         norms = jacobian.column_norms()
@@ -202,12 +185,6 @@ class LevenbergMarquardt:
         return torch.where(running, moved, damping), growth
 
 
-def _common(members: tuple[Status, ...]) -> Status:
-    """One status for a batch: the least favourable."""
-    order = [*(s for s in Status if not s.stationary), *(s for s in Status if s.stationary)]
-    return min(members, key=order.index)
-
-
 @dataclass(frozen=True)
 class GaussNewton:
     """Undamped steps J p = −r by QR; ends when the norm rises. For problems that are linear, or nearly so."""
@@ -218,11 +195,17 @@ class GaussNewton:
     def __post_init__(self) -> None:
         _check_solver(self.linear_solver)
 
-    def run(self, residual: Residual, xi: Tensor, on_iteration: Callback | None = None) -> OptimizeResult:
+    def run(
+        self,
+        residual: Residual,
+        xi: Tensor,
+        on_iteration: Callback | None = None,
+        checkpoint: Checkpoint | None = None,
+    ) -> OptimizeResult:
         inner = LevenbergMarquardt(
             self.stopping, 0.0, linear_solver=self.linear_solver, smallest_damping=0.0, largest_damping=0.0
         )
-        return inner.run(residual, xi, on_iteration)
+        return inner.run(residual, xi, on_iteration, checkpoint)
 
 
 # -- SciPy -----------------------------------------------------------------------------------------------------------
@@ -243,7 +226,14 @@ class ScipyLeastSquares:
         if self.method not in ("trf", "lm", "dogbox"):
             raise ValueError(f"method = {self.method!r}; allowed: trf, lm, dogbox")
 
-    def run(self, residual: Residual, xi: Tensor, on_iteration: Callback | None = None) -> OptimizeResult:
+    def run(
+        self,
+        residual: Residual,
+        xi: Tensor,
+        on_iteration: Callback | None = None,
+        checkpoint: Checkpoint | None = None,
+    ) -> OptimizeResult:
+        """Minimise ½‖r(ξ)‖² from ξ (N,); SciPy keeps its state to itself, so there are no checkpoints."""
         if xi.dim() != 1:
             raise ValueError(f"xi has shape {tuple(xi.shape)}; scipy solves one problem, shape (N,), at a time")
         rule, watch = self.stopping, Stopwatch()
@@ -251,7 +241,6 @@ class ScipyLeastSquares:
         check_start(residual, residual.residual(xi))
         count = {"residuals": 0, "linearisations": 0}
         best: list[tuple[float, Tensor]] = [(float("inf"), xi)]
-        stopped: list[Status] = []
         slow = 0
 
         def tensor(x: np.ndarray) -> Tensor:
@@ -293,8 +282,7 @@ class ScipyLeastSquares:
                 (watch.seconds > rule.cpu_seconds, Status.TIME_LIMIT),
             ):
                 if condition:
-                    stopped.append(status)
-                    raise _Stop
+                    raise Stop(status)
             return np.nan_to_num(r.detach().cpu().numpy(), nan=1e150, posinf=1e150, neginf=-1e150)
 
         def jacobian(x: np.ndarray) -> np.ndarray:
@@ -316,8 +304,8 @@ class ScipyLeastSquares:
             status = {0: Status.MAX_ITERATIONS, 2: Status.SMALL_DECREASE, 3: Status.SMALL_STEP}.get(
                 out.status, Status.SMALL_DECREASE
             )
-        except _Stop:
-            status = stopped[-1]
+        except Stop as stop:
+            status = stop.status
         except KeyboardInterrupt:
             status = Status.INTERRUPTED
         return OptimizeResult(
@@ -330,7 +318,3 @@ class ScipyLeastSquares:
             cpu_seconds=watch.seconds,
             member_status=(status,),
         )
-
-
-class _Stop(Exception):
-    """Ends SciPy's loop from inside the residual."""

@@ -1,0 +1,95 @@
+"""Optimisers one after the other, each from the best point of the one before."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from ponn_torch.optim.base import Callback, Optimizer, OptimizeResult, Record, Residual, Status
+from ponn_torch.optim.checkpoint import Arrays, Checkpoint, Nested, pack_records, under, unpack_records, within
+
+# what ends a chain before its last part
+ENOUGH = (Status.RESIDUAL, Status.ROUND_OFF, Status.BUDGET, Status.INTERRUPTED)
+
+
+@dataclass(frozen=True)
+class Chain:
+    """Run every part in turn; records, counts and times go on from one to the next.
+
+    A part that meets its tolerance ends the chain; one that ends by any other rule hands over.
+    """
+
+    parts: Sequence[Optimizer]
+
+    def __post_init__(self) -> None:
+        if not self.parts:
+            raise ValueError("parts = []; allowed: at least one optimiser")
+
+    def run(
+        self,
+        residual: Residual,
+        xi: Tensor,
+        on_iteration: Callback | None = None,
+        checkpoint: Checkpoint | None = None,
+    ) -> OptimizeResult:
+        """Minimise ½‖r(ξ)‖² from ξ."""
+        first, done, saved = 0, OptimizeResult(xi, xi.new_tensor(torch.inf), Status.INTERRUPTED), None
+        if checkpoint is not None and checkpoint.saved is not None:
+            first, done, saved = _restore(checkpoint.saved, xi)
+        for index in range(first, len(self.parts)):
+            nested = None if checkpoint is None else Nested(checkpoint, _pack(index, done), saved)
+            told = None if on_iteration is None else _continued(done, on_iteration)
+            result = self.parts[index].run(residual, done.xi, told, nested)
+            done, saved = _joined(done, result), None
+            if result.status in ENOUGH:
+                break
+        return done
+
+
+def _shifted(done: OptimizeResult, entry: Record) -> Record:
+    """A part's record, counted on from what was done before."""
+    before = {
+        "iteration": done.n_iterations,
+        "residuals": done.n_residuals,
+        "linearisations": done.n_linearisations,
+        "seconds": done.cpu_seconds,
+    }
+    return {**entry, **{key: entry[key] + value for key, value in before.items()}}
+
+
+def _continued(done: OptimizeResult, on_iteration: Callback) -> Callback:
+    return lambda entry, xi, r: on_iteration(_shifted(done, entry), xi, r)
+
+
+def _joined(done: OptimizeResult, result: OptimizeResult) -> OptimizeResult:
+    return replace(
+        result,
+        records=[*done.records, *(_shifted(done, entry) for entry in result.records)],
+        n_residuals=done.n_residuals + result.n_residuals,
+        n_linearisations=done.n_linearisations + result.n_linearisations,
+        cpu_seconds=done.cpu_seconds + result.cpu_seconds,
+    )
+
+
+def _pack(index: int, done: OptimizeResult) -> Arrays:
+    counts = {"index": index, "n_residuals": done.n_residuals, "n_linearisations": done.n_linearisations}
+    numbers = {name: torch.tensor(value) for name, value in counts.items()}
+    numbers["cpu_seconds"] = torch.tensor(done.cpu_seconds, dtype=torch.float64)
+    return numbers | {"xi": done.xi, "norm": done.norm} | within("records", pack_records(done.records))
+
+
+def _restore(saved: Arrays, like: Tensor) -> tuple[int, OptimizeResult, Arrays | None]:
+    """The part to go on with, what was done before it, and its own checkpoint."""
+    done = OptimizeResult(
+        xi=saved["xi"].to(like.device),
+        norm=saved["norm"].to(like.device),
+        status=Status.INTERRUPTED,
+        records=unpack_records(under("records", saved)),
+        n_residuals=int(saved["n_residuals"]),
+        n_linearisations=int(saved["n_linearisations"]),
+        cpu_seconds=float(saved["cpu_seconds"]),
+    )
+    return int(saved["index"]), done, under("part", saved) or None
