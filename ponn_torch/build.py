@@ -15,6 +15,8 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 
 from ponn_torch.ansatz.basis import LinearBasis
+from ponn_torch.optim.base import Optimizer
+from ponn_torch.optim.chain import Chain
 from ponn_torch.optimal_control.pontryagin import pontryagin
 from ponn_torch.optimal_control.problem import OptimalControlProblem, nearest
 from ponn_torch.optimal_control.references import load_problem
@@ -176,6 +178,10 @@ def _solver(node: dict[str, Any], top: Mapping[str, Any]) -> Solver:
     reject_unknown(nodes, ["kind", "n_nodes"], "nodes")
     for key in ("form", "optimizer", "continuation", "guess"):
         fields[key] = value_of(_section(node, key), hints[key], key)
+    finish = _section(node, "finish")
+    if finish:
+        parts = [fields["optimizer"], value_of(finish, Optimizer, "finish")]
+        fields["optimizer"] = call(Chain, {"parts": parts}, "optimizer")
     refinement = _section(node, "refinement")
     fields["refinement"] = value_of(refinement, hints["refinement"], "refinement") if refinement else None
     for key in (

@@ -134,7 +134,17 @@ INSTEAD = {
     "split": ["refinement.max_rounds=1", "refinement.stopping.max_iterations=2"],
     "subdivide": ["refinement.max_rounds=1", "refinement.stopping.max_iterations=2"],
     "custom": [REFERENCE],
+    "adam_lbfgs": [f"optimizer.parts.{i}.stopping.max_iterations=2" for i in (0, 1)],
+    "adam_lm": [f"optimizer.parts.{i}.stopping.max_iterations=2" for i in (0, 1)],
+    "lm_output": [
+        "optimizer.parts.0.stopping.max_iterations=2",
+        "optimizer.parts.1.optimizer.stopping.max_iterations=2",
+    ],
 }
+# Settings of a tiny budget that an option does not have.
+ABSENT = {"rbf": "ansatz.size", "none": "refinement.max_rounds"} | dict.fromkeys(
+    ("adam_lbfgs", "adam_lm", "lm_output"), "optimizer.stopping.max_iterations"
+)
 
 
 def tiny(group: str, option: str) -> list[str]:
@@ -149,9 +159,8 @@ def tiny(group: str, option: str) -> list[str]:
     elif group == "ansatz":
         chosen.pop("ansatz.size")
     for text in [f"{group}={option}", *INSTEAD.get(group, []), *INSTEAD.get(option, [])]:
-        absent = {"rbf": "ansatz.size", "none": "refinement.max_rounds"}.get(option)
-        if text.split("=")[0] != absent:
-            chosen[text.split("=")[0]] = text
+        chosen[text.split("=")[0]] = text
+    chosen.pop(ABSENT.get(option, ""), None)
     return list(chosen.values())
 
 

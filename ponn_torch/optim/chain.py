@@ -1,15 +1,18 @@
-"""Optimisers one after the other, each from the best point of the one before."""
+"""Optimisers made of others: one after the other, or on the output layer only."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from typing import cast
 
 import torch
 from torch import Tensor
 
 from ponn_torch.optim.base import Callback, Optimizer, OptimizeResult, Record, Residual, Status
 from ponn_torch.optim.checkpoint import Arrays, Checkpoint, Nested, pack_records, under, unpack_records, within
+from ponn_torch.optim.least_squares import GaussNewton
+from ponn_torch.optim.restricted import Layered, output_layer
 
 # what ends a chain before its last part
 ENOUGH = (Status.RESIDUAL, Status.ROUND_OFF, Status.BUDGET, Status.INTERRUPTED)
@@ -47,6 +50,41 @@ class Chain:
             if result.status in ENOUGH:
                 break
         return done
+
+
+@dataclass(frozen=True)
+class OutputLayer:
+    """Run an optimiser on all unknowns but the hidden weights, which stay as they are."""
+
+    optimizer: Optimizer = field(default_factory=GaussNewton)
+
+    def run(
+        self,
+        residual: Residual,
+        xi: Tensor,
+        on_iteration: Callback | None = None,
+        checkpoint: Checkpoint | None = None,
+    ) -> OptimizeResult:
+        """Minimise ½‖r(ξ)‖² over the output layer.
+
+        Raises:
+            TypeError: a residual without ``linear_unknowns``.
+        """
+        if not hasattr(residual, "linear_unknowns"):
+            raise TypeError(f"{type(residual).__name__} has no linear_unknowns, so its output layer is not known")
+        inner, saved = None, checkpoint.saved if checkpoint is not None else None
+        if saved is not None:
+            xi, saved = saved["xi"].to(xi.device), under("part", saved)
+        layer = output_layer(cast(Layered, residual), xi)
+        if checkpoint is not None:
+            inner = Nested(checkpoint, {"xi": xi}, saved)
+
+        def told(entry: Record, some: Tensor, r: Tensor) -> None:
+            if on_iteration is not None:
+                on_iteration(entry, layer.full(some), r)
+
+        result = self.optimizer.run(layer, layer.start, told, inner)
+        return replace(result, xi=layer.full(result.xi))
 
 
 def _shifted(done: OptimizeResult, entry: Record) -> Record:

@@ -12,7 +12,8 @@ from hypothesis import strategies as st
 from test_least_squares import Pointwise, landing, start_of
 
 from ponn_torch.optim.base import Status, Stop, Stopping
-from ponn_torch.optim.chain import Chain
+from ponn_torch.optim.chain import Chain, OutputLayer
+from ponn_torch.optim.checkpoint import CheckpointFile
 from ponn_torch.optim.driver import Counted
 from ponn_torch.optim.gradient import SCHEDULES, Adam
 from ponn_torch.optim.least_squares import LevenbergMarquardt
@@ -225,6 +226,33 @@ def test_a_chain_ends_where_its_tolerance_is_met():
     result = Chain([LevenbergMarquardt(Stopping(tolerance=1e-6)), Adam()]).run(residual, start)
     assert result.status is Status.RESIDUAL
     assert result.n_iterations < 50
+
+
+class Layers(Pointwise):
+    """exp(−ξ0 t) ξ1 fitted to data: ξ0 is a hidden weight, ξ1 the output layer."""
+
+    linear_unknowns = torch.tensor([1])
+
+
+def test_the_output_layer_is_solved_with_hidden_weights_held(tmp_path):
+    t = torch.linspace(0, 1, 7, dtype=torch.float64)
+    residual = Layers(lambda x: x[1] * torch.exp(-x[0] * t) - torch.exp(-2 * t))
+    start = torch.tensor([1.5, 0.0], dtype=torch.float64)
+    seen = []
+    result = OutputLayer().run(residual, start, lambda record, xi, r: seen.append(xi))
+    feature = torch.exp(-1.5 * t)
+    best = float(feature @ torch.exp(-2 * t) / (feature @ feature))
+    assert result.xi.tolist() == pytest.approx([1.5, best], rel=1e-12)
+    assert torch.equal(seen[-1], result.xi)
+
+    def stop(record, xi, r):
+        raise KeyboardInterrupt
+
+    OutputLayer().run(residual, start, stop, CheckpointFile(tmp_path / "x.npz"))
+    resumed = OutputLayer().run(residual, 0 * start, None, CheckpointFile(tmp_path / "x.npz", resume=True))
+    assert torch.equal(resumed.xi, result.xi)
+    with pytest.raises(TypeError, match="Pointwise has no linear_unknowns"):
+        OutputLayer().run(start_of("linear")[0], start)
 
 
 @pytest.mark.parametrize(
