@@ -6,6 +6,7 @@ that its place asks for. Nothing outside the package is called, except the probl
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -182,6 +183,9 @@ def _solver(node: dict[str, Any], top: Mapping[str, Any]) -> Solver:
     if finish:
         parts = [fields["optimizer"], value_of(finish, Optimizer, "finish")]
         fields["optimizer"] = call(Chain, {"parts": parts}, "optimizer")
+    budget = _section(node, "budget")
+    fields["cpu_seconds"] = budget.pop("cpu_seconds", math.inf)
+    reject_unknown(budget, ["cpu_seconds"], "budget")
     refinement = _section(node, "refinement")
     fields["refinement"] = value_of(refinement, hints["refinement"], "refinement") if refinement else None
     for key in (

@@ -29,6 +29,7 @@ PLACES = {
     "node_kind": "nodes.kind",
     "kind": "nodes.kind",
     "n_nodes": "nodes.n_nodes",
+    "cpu_seconds": "budget.cpu_seconds",
 }
 KINDS = {float: "a number", int: "an integer", bool: "true or false", str: "text", NoneType: "null"}
 

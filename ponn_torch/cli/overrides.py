@@ -156,8 +156,10 @@ def _check(overrides: Sequence[str]) -> None:
             chosen.append(f"{name}={values[0]}")
     base = _compose(chosen, with_hydra=True)
     for override in parsed:
-        if override.key_or_group not in options and override.type is OverrideType.CHANGE:
-            _check_key(base, override.key_or_group, list(options))
+        name = override.key_or_group
+        plugin = name.startswith("hydra/") or name.startswith("hydra.launcher.")  # Hydra knows what is installed
+        if name not in options and not plugin and override.type is OverrideType.CHANGE:
+            _check_key(base, name, list(options))
 
 
 def _parsed(text: str) -> Override:

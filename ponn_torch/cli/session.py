@@ -98,6 +98,9 @@ def sweep_member(config: DictConfig) -> float:
     job = HydraConfig.get().job
     print(f"\n[{job.num}] {job.override_dirname}", flush=True)
     outcome = _member(config)
+    folder = Path(HydraConfig.get().runtime.output_dir)
+    verdict = "certified" if outcome.certified else "not certified" if outcome.exit_code in (0, 2) else "failed"
+    print(f"[{job.num}] {verdict}; {len(list(folder.parent.rglob(OUTCOME)))} members done", flush=True)
     if outcome.exit_code == INTERRUPTED:
         raise KeyboardInterrupt
     return outcome.score
@@ -129,12 +132,15 @@ def _plain(text: str) -> bool:
 
 
 def _summary(folder: Path, members: list[tuple[Path, dict[str, Any]]]) -> str:
-    """A line per member, and how many of them were certified."""
-    lines = ["", f"{'member':8}{'cost':>16}  {'CPU s':>7}  settings: result"]
+    """A line per member, with the settings in which it differs, and how many of them were certified."""
+    first = members[0][1]["overrides"] if len(members) > 1 else []
+    shared = [text for text in first if all(text in outcome["overrides"] for _, outcome in members)]
+    lines = ["", *([f"all: {' '.join(shared)}"] if shared else [])]
+    lines.append(f"{'member':8}{'cost':>16}  {'CPU s':>7}  settings: result")
     for place, outcome in members:
         cost = float(outcome["cost"]) if outcome["cost"] is not None else math.nan
         shown = f"{cost:>16.10g}" if math.isfinite(cost) else f"{'–':>16}"
-        settings = " ".join(outcome["overrides"]) or "defaults"
+        settings = " ".join(text for text in outcome["overrides"] if text not in shared) or "defaults"
         told = " ".join(["certified", "-".join(outcome["arcs"])]).strip()
         told = told if outcome["certified"] else outcome["message"]
         lines.append(f"{place.name:8}{shown}  {outcome['cpu_seconds']:7.2f}  {settings}: {told}")

@@ -38,6 +38,11 @@ class Status(Enum):
         """The optimiser ended by itself at a point it cannot improve (not: a correct solution)."""
         return self in _STATIONARY
 
+    @property
+    def cut(self) -> bool:
+        """The run was ended from outside: nothing more is to be computed."""
+        return self in (Status.INTERRUPTED, Status.BUDGET)
+
 
 _STATIONARY = {
     Status.RESIDUAL,

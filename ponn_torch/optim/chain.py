@@ -14,8 +14,7 @@ from ponn_torch.optim.checkpoint import Arrays, Checkpoint, Nested, pack_records
 from ponn_torch.optim.least_squares import GaussNewton
 from ponn_torch.optim.restricted import Layered, output_layer
 
-# what ends a chain before its last part
-ENOUGH = (Status.RESIDUAL, Status.ROUND_OFF, Status.BUDGET, Status.INTERRUPTED)
+ENOUGH = (Status.RESIDUAL, Status.ROUND_OFF)  # what a part may end with that leaves nothing for the next
 
 
 @dataclass(frozen=True)
@@ -47,7 +46,7 @@ class Chain:
             told = None if on_iteration is None else _continued(done, on_iteration)
             result = self.parts[index].run(residual, done.xi, told, nested)
             done, saved = _joined(done, result), None
-            if result.status in ENOUGH:
+            if result.status in ENOUGH or result.status.cut:
                 break
         return done
 

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from ponn_torch.ansatz.basis import Legendre, LinearBasis
 from ponn_torch.numerics.nodes import make_nodes
-from ponn_torch.optim.base import Callback, OptimizeResult, Status, Stopping
+from ponn_torch.optim.base import Callback, OptimizeResult, Stopping
 from ponn_torch.optim.least_squares import LevenbergMarquardt
 from ponn_torch.optimal_control.collocation import Collocation
 from ponn_torch.optimal_control.curve import Curve
@@ -37,7 +37,7 @@ class Outcome(Enum):
     COARSE = "the residual between the nodes stayed above its tolerance"
     TOO_MANY_ARCS = "S asks for more arcs than allowed: a singular arc, or a curve that is no solution"
     TOO_MANY_SEGMENTS = "more segments were needed than allowed"
-    INTERRUPTED = "interrupted from the keyboard"
+    INTERRUPTED = "interrupted, from the keyboard or by the budget"
 
 
 @dataclass(frozen=True)
@@ -159,7 +159,7 @@ class Subdivide(Segmentation):
                 return Refined(curve, Outcome.TOO_MANY_SEGMENTS, rounds)
             solution, result = self.solve(Collocation.on_segments(disc, times, setting=setting), curve, callback)
             rounds.append(result)
-            if result.status is Status.INTERRUPTED:
+            if result.status.cut:
                 return Refined(solution, Outcome.INTERRUPTED, rounds)
             if self.solved(result):
                 curve, outcome = solution, Outcome.COARSE

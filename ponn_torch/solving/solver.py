@@ -6,6 +6,7 @@ start that fails is recognised early and the next one is tried; whatever was com
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
@@ -21,6 +22,7 @@ from ponn_torch.optim.base import (
     OptimizeResult,
     Record,
     Status,
+    Stop,
     Stopping,
     Stopwatch,
 )
@@ -76,6 +78,7 @@ class Solver:
         start_limit: ‖r‖ of the first stage above which a start has failed.
         trust: a stage is kept while its off-node residual is below this fraction of the largest rate; below the
             resolution of the nodes the residual between them gives a broken stage away.
+        cpu_seconds: budget of the whole solve, certificates apart; what there is when it is spent is kept.
     """
 
     basis: LinearBasis = field(default_factory=lambda: Chebyshev(30))
@@ -93,6 +96,7 @@ class Solver:
     start_limit: float = 0.1
     trust: float = 0.02
     mass_variable: str = "auto"
+    cpu_seconds: float = math.inf
     tolerances: Tolerances = field(default_factory=Tolerances)
     dtype: torch.dtype = torch.float64
     device: str = "cpu"
@@ -102,6 +106,8 @@ class Solver:
             value = getattr(self, name)
             if value < 1:
                 raise ValueError(f"{name} = {value}; allowed: at least 1")
+        if not self.cpu_seconds > 0:
+            raise ValueError(f"cpu_seconds = {self.cpu_seconds}; allowed: a positive number")
 
     def solve(self, problem: OptimalControlProblem, seed: int = 0, observer: Observer | None = None) -> SolveResult:
         """Solve from random starts of ``seed``; the result's message says what happened, it does not raise."""
@@ -118,6 +124,28 @@ class _Interrupted(Exception):
     """Ctrl-C reached an optimiser, which gave its best point back."""
 
 
+class Budget:
+    """CPU seconds spent inside its ``with`` blocks, and whether they are more than allowed."""
+
+    def __init__(self, allowed: float) -> None:
+        self._allowed, self._before, self._watch = allowed, 0.0, Stopwatch()
+        self._running = False
+
+    def __enter__(self) -> None:
+        self._watch, self._running = Stopwatch(), True
+
+    def __exit__(self, *_: object) -> None:
+        self._before, self._running = self.seconds, False
+
+    @property
+    def seconds(self) -> float:
+        return self._before + (self._watch.seconds if self._running else 0.0)
+
+    @property
+    def spent(self) -> bool:
+        return self.seconds > self._allowed
+
+
 class _Run:
     """One solve: holds the stages so far, so that nothing computed is lost whatever ends it."""
 
@@ -129,23 +157,22 @@ class _Run:
         self.start = 0
         self.refused: list[Tensor] = []  # where smoothed solutions began whose refinement failed
         self.note = ""
+        self.clock = Budget(solver.cpu_seconds)
 
     # -- the line ------------------------------------------------------------------------------------------------------
 
     def result(self) -> SolveResult:
         best: tuple[Solution, Certificate] | None = None
         message, interrupted, n_certified = "", False, 0
-        seconds = 0.0  # certificates apart
         try:
             for start in range(self.solver.n_starts):
                 self.start = start
-                watch = Stopwatch()
-                try:
+                with self.clock:
                     candidate, note = self._one_start()
-                finally:
-                    seconds += watch.seconds
                 message = note or message
                 if candidate is None:
+                    if self.clock.spent:
+                        break
                     continue
                 judged = certify(candidate, self.solver.tolerances)
                 n_certified += judged.certified
@@ -153,10 +180,12 @@ class _Run:
                     best, message = (candidate, judged), note or judged.verdict
                 # unrefined, a start that came through its stages is the answer, certified or not
                 enough = 1 if self.solver.refinement is None else n_certified
-                if enough >= self.solver.n_certified:
+                if enough >= self.solver.n_certified or self.clock.spent:
                     break
         except (_Interrupted, KeyboardInterrupt):
             interrupted, message = True, "interrupted; the best stage so far is kept"
+        if self.clock.spent and not (best and best[1].certified) and Status.BUDGET.value not in message:
+            message = f"{Status.BUDGET.value}: {message}"
         solution = best[0] if best else self._last_stage()
         if solution is not None:
             self.observer.solution(solution)
@@ -165,7 +194,7 @@ class _Run:
         else:
             self.observer.failed(message)
         certificate = best[1] if best else None
-        return SolveResult(solution, certificate, self.stages, self.start + 1, message, seconds, interrupted)
+        return SolveResult(solution, certificate, self.stages, self.start + 1, message, self.clock.seconds, interrupted)
 
     def _one_start(self) -> tuple[Solution | None, str]:
         """Everything between a first guess and a trajectory to be judged; None and why where that fails."""
@@ -211,6 +240,8 @@ class _Run:
 
         def attempt(value: float, parameter: str, form: Form | None, *, hold: bool = False) -> Outcome:
             nonlocal current, xi, kept, message, first
+            if self.clock.spent:
+                return Outcome.ABORT
             trial = replace(current, discretisation=self._discretisation(form))
             if parameter != "smoothing" or self._smoothable:
                 trial = trial.with_setting(**{parameter: value})
@@ -278,7 +309,7 @@ class _Run:
         for result in refined.rounds[:-1]:
             self._stage(name, None, result, float("nan"), float("nan"), None)
         solution = self._record(name, refined.curve, refined.rounds[-1])
-        if refined.outcome is refinements.Outcome.INTERRUPTED:
+        if refined.outcome is refinements.Outcome.INTERRUPTED and not self.clock.spent:
             raise _Interrupted
         if refined.outcome is refinements.Outcome.SOLVED:
             return solution, ""
@@ -297,6 +328,8 @@ class _Run:
                 return float(collocation.cost(xi))
 
             self.observer.iteration(record, blocks, cost)
+            if self.clock.spent:
+                raise Stop(Status.BUDGET)
 
         return on_iteration
 

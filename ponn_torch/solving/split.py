@@ -14,7 +14,7 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from ponn_torch.optim.base import OptimizeResult, Status
+from ponn_torch.optim.base import OptimizeResult
 from ponn_torch.optimal_control.collocation import Collocation
 from ponn_torch.optimal_control.control_laws import Regime
 from ponn_torch.optimal_control.curve import Curve
@@ -56,7 +56,7 @@ class Split(Segmentation):
                 sharper = self.sharpening * smoothing
                 smoothed, result = self._sharpened(disc, smoothed, sharper, attempt * self.n_segments, callback)
                 rounds.append(result)
-                if result.status is Status.INTERRUPTED:
+                if result.status.cut:
                     return Refined(smoothed, Outcome.INTERRUPTED, rounds)
             refined = self._split(disc, smoothed, attempt * self.n_segments, rounds, callback)
         return refined
@@ -86,7 +86,7 @@ class Split(Segmentation):
             )
             solution, result = self.solve(collocation, curve, callback)
             rounds.append(result)
-            if result.status is Status.INTERRUPTED:
+            if result.status.cut:
                 return Refined(solution, Outcome.INTERRUPTED, rounds)
             if not self.solved(result):
                 ends = solution.times[[0, *collocation.switch_knots, -1]]
