@@ -50,6 +50,7 @@ class Recording:
         progress: print while solving. tensorboard: event files, with small ``stage_figures`` of every stage.
         cost_every: iterations between evaluations of the cost, 0 for stage ends only.
         figures: PNG figures at the end.
+        reference: folder of a saved solution; errors of states and costates against it are taken with the cost.
     """
 
     progress: bool = True
@@ -57,6 +58,7 @@ class Recording:
     stage_figures: bool = True
     cost_every: int = 10
     figures: bool = True
+    reference: str | None = None
 
     def __post_init__(self) -> None:
         if self.cost_every < 0:

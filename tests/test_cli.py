@@ -79,6 +79,10 @@ def events_in(folder: Path) -> list[str]:
         ("mass_variable=logmass", ["mass_variable = 'logmass'", "delta_v", "'log_mass'"]),
         ("optimizer.linear_solver=chol", ["optimizer.linear_solver = 'chol'", "qr", "'cholesky'"]),
         ("dtype=float16", ["dtype = 'float16'", "'float64'"]),
+        ("budget.cpu_seconds=0", ["budget.cpu_seconds = 0", "positive"]),
+        ("budget.seconds=3", ["budget.seconds", "cpu_seconds"]),
+        ("finish=output_layr", ["finish = 'output_layr'", "'output_layer'"]),
+        ("optimizer=adam_lbgs", ["optimizer = 'adam_lbgs'", "'adam_lbfgs'"]),
         ("device=gpu", ["device = 'gpu'", "cpu"]),
         ("problem.final_time_days=long", ["problem.final_time_days = 'long'", "a number"]),
         ("problem.final_time_days=-3", ["problem.final_time_days = -3", "positive"]),
@@ -243,6 +247,18 @@ def test_sweep_counts_and_explains_members_that_fail(capsys: pytest.CaptureFixtu
     assert outcomes[0]["known_cost"] == pytest.approx(268.0146563274)
     assert outcomes[2]["known_cost"] is None
     assert "problem.initial_mass = -1" in (folder / "1" / "failure.txt").read_text(encoding="utf-8")
+
+
+@pytest.mark.slow
+def test_sweep_in_parallel_runs_every_member(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    folder = tmp_path / "sweep"
+    parallel = ["hydra/launcher=joblib", "hydra.launcher.n_jobs=2"]
+    members = ["seed=range(2)", "problem.initial_mass=1905,-1"]
+    assert main(["-m", *LANDING, *members, *parallel, f"hydra.sweep.dir='{folder}'"]) == 1
+    assert "2 of 4 certified, 2 failed" in capsys.readouterr().out
+    for i in range(4):
+        environment = json.loads((folder / str(i) / "environment.json").read_text(encoding="utf-8"))
+        assert environment["torch_threads"] == 1
 
 
 def test_sweep_over_a_misspelt_config_does_not_begin(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:

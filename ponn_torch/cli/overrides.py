@@ -157,7 +157,7 @@ def _check(overrides: Sequence[str]) -> None:
     base = _compose(chosen, with_hydra=True)
     for override in parsed:
         name = override.key_or_group
-        plugin = name.startswith("hydra/") or name.startswith("hydra.launcher.")  # Hydra knows what is installed
+        plugin = name.startswith(("hydra/", "hydra.launcher."))  # Hydra knows what is installed
         if name not in options and not plugin and override.type is OverrideType.CHANGE:
             _check_key(base, name, list(options))
 

@@ -16,8 +16,10 @@ from omegaconf import DictConfig, OmegaConf
 
 from ponn_torch.build import Plan, build, resolved
 from ponn_torch.optimal_control.problem import DisplayUnit
+from ponn_torch.reporting.members import OUTCOME, SOLUTION
 from ponn_torch.reporting.recorder import Recorder, finite_or_none
 from ponn_torch.reporting.records import RECORDS, RunRecorder
+from ponn_torch.reporting.reference import Reference
 from ponn_torch.reporting.report import (
     CERTIFICATE,
     ENVIRONMENT,
@@ -34,7 +36,7 @@ from ponn_torch.solving.observer import StageResult
 from ponn_torch.solving.solution import Solution
 
 DONE, BAD_INPUT, NOT_CERTIFIED, BUG, INTERRUPTED = 0, 1, 2, 3, 130
-CONFIG, OVERRIDES, OUTCOME, SOLUTION = "config.yaml", "overrides.yaml", "outcome.json", "solution"
+CONFIG, OVERRIDES = "config.yaml", "overrides.yaml"
 FILES = (CONFIG, OVERRIDES, OUTCOME, RECORDS, REPORT, ENVIRONMENT, CERTIFICATE, FAILURE, FAILURE_TEXT)
 
 
@@ -132,6 +134,7 @@ def _solve(plan: Plan, folder: Path, keeper: _Keeper) -> Outcome:
         progress=recording.progress,
         cost_every=recording.cost_every,
         figures=recording.stage_figures,
+        reference=_reference(plan),
         extra=(keeper,),
     )
     with recorder:
@@ -142,6 +145,23 @@ def _solve(plan: Plan, folder: Path, keeper: _Keeper) -> Outcome:
     if result.interrupted:
         code = INTERRUPTED
     return Outcome(code, result.message)
+
+
+def _reference(plan: Plan) -> Reference | None:
+    """The solution that the run is measured against.
+
+    Raises:
+        ConfigError: none is there, or it is one of another problem.
+    """
+    if plan.recording.reference is None:
+        return None
+    try:
+        solution = Solution.load(plan.recording.reference)
+        if solution.problem.states != plan.problem.states:
+            raise ValueError(f"it solves {solution.problem.name!r}, which has other states")
+        return Reference(solution)
+    except (OSError, ValueError) as error:
+        raise ConfigError(f"record.reference = {plan.recording.reference!r}: {one_line(error)}") from error
 
 
 def _completed(outcome: Outcome, keeper: _Keeper, overrides: Sequence[str], seconds: float) -> Outcome:

@@ -20,7 +20,8 @@ from omegaconf import DictConfig, OmegaConf
 
 from ponn_torch.build import Plan, build
 from ponn_torch.cli.overrides import CONFIG, Command, InputError, composed, config_folder
-from ponn_torch.cli.run import OUTCOME, Outcome, run
+from ponn_torch.cli.run import Outcome, run
+from ponn_torch.reporting.members import OUTCOME
 from ponn_torch.settings import ConfigError
 
 BUG, BAD_INPUT, INTERRUPTED = 3, 1, 130

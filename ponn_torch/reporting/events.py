@@ -6,7 +6,7 @@ import io
 import math
 import time
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -18,12 +18,13 @@ from ponn_torch.optim.base import Record
 from ponn_torch.reporting.figures import stage_figure
 from ponn_torch.reporting.recorder import Recorder
 from ponn_torch.solving.certificate import Certificate
-from ponn_torch.solving.observer import StageResult
+from ponn_torch.solving.observer import Look, StageResult
 from ponn_torch.solving.solution import Solution
 
 # Written at every iteration; NaN where an optimiser has no such thing, so that runs share their charts.
 OPTIM_TAGS = ("damping", "step", "accepted", "running", "residuals", "linearisations")
 METRICS = ("certificate/certified", "certificate/end_error_scaled", "certificate/cost", "time/seconds")
+ERRORS = ("states", "costates")  # against a reference, where there is one
 MAX_FIGURES = 30  # TensorBoard crawls under hundreds
 
 
@@ -56,7 +57,7 @@ def _numbers(values: Mapping[str, Any]) -> dict[str, float]:
 
 
 class TensorBoard(Recorder):
-    """residual/total, residual/<equation>, optim/*, stage/*, cost/<cost_name>, certificate/*, time/seconds.
+    """residual/total, residual/<equation>, optim/*, stage/*, cost/<cost_name>, error/*, certificate/*, time/seconds.
 
     All scalars of an iteration are one event, which costs a tenth of a call per scalar. Hyperparameters go
     into the same writer, so that no second run appears beside this one.
@@ -88,19 +89,20 @@ class TensorBoard(Recorder):
         self._stage = index
         self._writer.add_text("stage/started", f"{name}, ρ = {smoothing}" if smoothing else name, self._step)
 
-    def iteration(self, record: Record, blocks: Callable[[], Mapping[str, float]], cost: Callable[[], float]) -> None:
+    def iteration(self, record: Record, look: Look) -> None:
         self._step = int(record.get("global_step", self._step + 1))
         values = {"residual/total": float(record["norm"])}
-        values |= {f"residual/{name}": float(norm) for name, norm in blocks().items()}
+        values |= {f"residual/{name}": float(norm) for name, norm in look.blocks().items()}
         values |= {f"optim/{name}": float(record.get(name, math.nan)) for name in OPTIM_TAGS}
         values["stage/index"] = float(self._stage)
         smoothing = record.get("smoothing")
         if smoothing is not None:
             values["stage/smoothing"] = float(smoothing)
         values["time/seconds"] = self._seconds
-        value = cost()
+        value = look.cost()
         if math.isfinite(value):
             values[self._cost_tag] = value
+        values |= {f"error/{name}": float(record[f"error_{name}"]) for name in ERRORS if f"error_{name}" in record}
         self._scalars(values, self._step)
 
     def stage_ended(self, stage: StageResult) -> None:

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING
 
 from ponn_torch.optim.base import Record
 from ponn_torch.reporting.recorder import Recorder
 from ponn_torch.solving.certificate import Certificate
-from ponn_torch.solving.observer import StageResult
+from ponn_torch.solving.observer import Look, StageResult
 from ponn_torch.solving.solution import Solution
 
 if TYPE_CHECKING:
@@ -61,10 +60,10 @@ class Progress(Recorder):
     def stage_started(self, name: str, smoothing: float | None, index: int) -> None:
         self._live(f"{name:7} {_smoothing(smoothing)}")
 
-    def iteration(self, record: Record, blocks: Callable[[], Mapping[str, float]], cost: Callable[[], float]) -> None:
+    def iteration(self, record: Record, look: Look) -> None:
         if self._bar is None:
             return
-        value = cost()
+        value = look.cost()
         self._cost = value if math.isfinite(value) else self._cost
         known = f"  cost {self._cost:.7g}" if math.isfinite(self._cost) else ""
         smoothing = record.get("smoothing")

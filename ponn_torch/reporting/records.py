@@ -9,7 +9,7 @@ from __future__ import annotations
 import functools
 import json
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any
@@ -17,8 +17,9 @@ from typing import TYPE_CHECKING, Any
 from ponn_torch.optim.base import Record
 from ponn_torch.reporting.progress import Progress
 from ponn_torch.reporting.recorder import Recorder, finite_or_none, stage_entry
+from ponn_torch.reporting.reference import Reference
 from ponn_torch.solving.certificate import Certificate
-from ponn_torch.solving.observer import StageResult
+from ponn_torch.solving.observer import Look, StageResult
 from ponn_torch.solving.solution import Solution
 
 if TYPE_CHECKING:
@@ -50,10 +51,10 @@ class JsonLines(Recorder):
     def stage_started(self, name: str, smoothing: float | None, index: int) -> None:
         self._write("stage_started", name=name, smoothing=smoothing, index=index)
 
-    def iteration(self, record: Record, blocks: Callable[[], Mapping[str, float]], cost: Callable[[], float]) -> None:
-        value = cost()
+    def iteration(self, record: Record, look: Look) -> None:
+        value = look.cost()
         known = {"cost": value} if math.isfinite(value) else {}
-        self._write("iteration", **record, residual=dict(blocks()), **known)
+        self._write("iteration", **record, residual=dict(look.blocks()), **known)
 
     def stage_ended(self, stage: StageResult) -> None:
         self._write("stage", **stage_entry(stage))
@@ -66,6 +67,15 @@ class JsonLines(Recorder):
 
     def close(self) -> None:
         self._stream.close()
+
+
+class _Once:
+    """A look that measures at most once, and what is dear only when due."""
+
+    def __init__(self, look: Look, due: bool) -> None:
+        self.blocks = functools.cache(look.blocks)
+        self.cost = functools.cache(look.cost if due else lambda: math.nan)
+        self.curve = look.curve
 
 
 class RunRecorder(Recorder):
@@ -81,6 +91,7 @@ class RunRecorder(Recorder):
         cost_name: the problem's, for the tag cost/<cost_name>.
         cost_every: the cost is an integral, dearer than an iteration, so it is taken at every n-th
             iteration only, and at stage ends (0: only there).
+        reference: a known solution; errors against it are taken whenever the cost is.
         figures: small figures of every stage in TensorBoard, drawn when the run is closed.
     """
 
@@ -94,6 +105,7 @@ class RunRecorder(Recorder):
         progress: bool = True,
         cost_every: int = 50,
         figures: bool = True,
+        reference: Reference | None = None,
         console: Console | None = None,
         extra: tuple[Recorder, ...] = (),
     ) -> None:
@@ -113,6 +125,7 @@ class RunRecorder(Recorder):
             self.recorders.append(Progress(console))
         self.recorders.extend(extra)
         self._stage: dict[str, Any] = {}
+        self._reference = reference
         self._closed = False
 
     def stage_started(self, name: str, smoothing: float | None, index: int) -> None:
@@ -120,14 +133,15 @@ class RunRecorder(Recorder):
         for recorder in self.recorders:
             recorder.stage_started(name, smoothing, index)
 
-    def iteration(self, record: Record, blocks: Callable[[], Mapping[str, float]], cost: Callable[[], float]) -> None:
+    def iteration(self, record: Record, look: Look) -> None:
         self.step += 1
         due = self._cost_every > 0 and self.step % self._cost_every == 0
         numbered = {"global_step": self.step, **self._stage, **record}
-        once_blocks = functools.cache(blocks)
-        once_cost = functools.cache(cost if due else lambda: math.nan)
+        if due and self._reference is not None:
+            numbered |= {f"error_{name}": error for name, error in self._reference.errors(look.curve()).items()}
+        once = _Once(look, due)
         for recorder in self.recorders:
-            recorder.iteration(numbered, once_blocks, once_cost)
+            recorder.iteration(numbered, once)
 
     def stage_ended(self, stage: StageResult) -> None:
         for recorder in self.recorders:

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Protocol
 
 from ponn_torch.optim.base import Record, Status
 
 if TYPE_CHECKING:
+    from ponn_torch.optimal_control.curve import Curve
     from ponn_torch.solving.certificate import Certificate
     from ponn_torch.solving.solution import Solution
 
@@ -42,14 +43,28 @@ class StageResult:
     solution: Solution | None = field(default=None, repr=False)
 
 
+class Look(Protocol):
+    """The best point so far, seen when asked."""
+
+    def blocks(self) -> Mapping[str, float]:
+        """Norm of the residual per equation."""
+        ...
+
+    def cost(self) -> float:
+        """By the nodes' quadrature, in the user's units."""
+        ...
+
+    def curve(self) -> Curve: ...
+
+
 class Observer:
     """Called by the conductor; inherit from it to override what matters, the rest does nothing."""
 
     def stage_started(self, name: str, smoothing: float | None, index: int) -> None:
         """Stage ``index`` (counted over all starts from 0) begins."""
 
-    def iteration(self, record: Record, blocks: Callable[[], Mapping[str, float]], cost: Callable[[], float]) -> None:
-        """An iteration ended; ``blocks`` (norm per equation) and ``cost`` (user units) run when called."""
+    def iteration(self, record: Record, look: Look) -> None:
+        """An iteration ended; what ``look`` is asked for is computed then."""
 
     def stage_ended(self, stage: StageResult) -> None:
         """The stage that was started last ended."""

@@ -120,6 +120,24 @@ class Solver:
         return Discretisation(bvp, basis, nodes, form or self.form, self.conditioning)
 
 
+@dataclass(frozen=True)
+class _Iterate:
+    """The best point of an iteration, for observers."""
+
+    collocation: Collocation
+    xi: Tensor
+    residual: Tensor
+
+    def blocks(self) -> Mapping[str, float]:
+        return {name: float(value) for name, value in self.collocation.blocks(self.residual).items()}
+
+    def cost(self) -> float:
+        return float(self.collocation.cost(self.xi))
+
+    def curve(self) -> Curve:
+        return Curve(self.collocation, self.xi)
+
+
 class _Interrupted(Exception):
     """Ctrl-C reached an optimiser, which gave its best point back."""
 
@@ -240,7 +258,7 @@ class _Run:
 
         def attempt(value: float, parameter: str, form: Form | None, *, hold: bool = False) -> Outcome:
             nonlocal current, xi, kept, message, first
-            if self.clock.spent:
+            if self.clock.spent and not first:
                 return Outcome.ABORT
             trial = replace(current, discretisation=self._discretisation(form))
             if parameter != "smoothing" or self._smoothable:
@@ -318,16 +336,10 @@ class _Run:
     # -- bookkeeping -------------------------------------------------------------------------------------------------
 
     def _callback(self, collocation: Collocation) -> Callback:
-        """Translate an optimiser's iteration for the observer; norms and cost are computed only if asked for."""
+        """Tell the observer of an optimiser's iterations, and end the run when its time is spent."""
 
         def on_iteration(record: Record, xi: Tensor, residual: Tensor) -> None:
-            def blocks() -> Mapping[str, float]:
-                return {name: float(value) for name, value in collocation.blocks(residual).items()}
-
-            def cost() -> float:
-                return float(collocation.cost(xi))
-
-            self.observer.iteration(record, blocks, cost)
+            self.observer.iteration(record, _Iterate(collocation, xi, residual))
             if self.clock.spent:
                 raise Stop(Status.BUDGET)
 

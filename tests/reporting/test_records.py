@@ -117,6 +117,24 @@ def test_records_hold_every_iteration_and_stage(runs, name):
     assert [line["certified"] for line in certificate] == [result.certificate.certified]
 
 
+class Seen:
+    """A look whose answers are given, and which notes what it was asked."""
+
+    def __init__(self, blocks, cost, asked=None):
+        self._blocks, self._cost, self._asked = blocks, cost, [] if asked is None else asked
+
+    def blocks(self):
+        self._asked.append("blocks")
+        return self._blocks
+
+    def cost(self):
+        self._asked.append("cost")
+        return self._cost
+
+    def curve(self):
+        raise AssertionError("nobody needs the curve")
+
+
 def record(norm=1.0, **more):
     return {"iteration": 1, "norm": norm, "accepted": True, **more}
 
@@ -124,7 +142,7 @@ def record(norm=1.0, **more):
 def test_an_interrupted_run_keeps_all_it_had(tmp_path):
     recorder = RunRecorder(tmp_path, tensorboard=False, progress=False)
     recorder.stage_started("smooth", 1.0, 0)
-    recorder.iteration(record(), lambda: {"r": 2.0}, lambda: 3.0)
+    recorder.iteration(record(), Seen({"r": 2.0}, 3.0))
     # nothing was closed or flushed by hand
     assert [line["event"] for line in lines(tmp_path)] == ["stage_started", "iteration"]
     recorder.close()
@@ -135,7 +153,7 @@ def test_what_is_costly_is_evaluated_once_and_only_when_due(tmp_path):
     calls = []
     with RunRecorder(tmp_path, progress=False, cost_every=2, figures=False) as recorder:
         for _ in range(4):
-            recorder.iteration(record(), lambda: calls.append("blocks") or {}, lambda: calls.append("cost") or 1.0)
+            recorder.iteration(record(), Seen({}, 1.0, calls))
     assert (calls.count("blocks"), calls.count("cost")) == (4, 2)
     with pytest.raises(ValueError, match="cost_every = -1"):
         RunRecorder(tmp_path, cost_every=-1)
@@ -144,7 +162,7 @@ def test_what_is_costly_is_evaluated_once_and_only_when_due(tmp_path):
 def test_numbers_that_are_not_finite_stay_valid_json(tmp_path):
     stage = StageResult("split", None, Status.MAX_ITERATIONS, math.inf, 1, 1, 1, 0.0, math.nan, math.nan)
     with RunRecorder(tmp_path, progress=False, figures=False) as recorder:
-        recorder.iteration(record(norm=math.nan), lambda: {"r": math.inf}, lambda: math.nan)
+        recorder.iteration(record(norm=math.nan), Seen({"r": math.inf}, math.nan))
         recorder.stage_ended(stage)
         recorder.failed("no start led to a solution")
     iteration, ended, failure = lines(tmp_path)
@@ -160,7 +178,7 @@ def test_away_from_a_terminal_progress_is_a_line_per_stage(tmp_path, solved):
     result = solved("split")
     with RunRecorder(tmp_path, tensorboard=False, console=Console(file=stream, width=200)) as recorder:
         recorder.stage_started("smooth", 1.0, 0)
-        recorder.iteration(record(), dict, lambda: 1.0)
+        recorder.iteration(record(), Seen({}, 1.0))
         for stage in result.stages:
             recorder.stage_ended(stage)
         recorder.certificate(result.certificate)
@@ -175,6 +193,6 @@ def test_on_a_terminal_progress_is_live(tmp_path):
     stream = io.StringIO()
     console = Console(file=stream, width=120, force_terminal=True)
     with RunRecorder(tmp_path, tensorboard=False, console=console, cost_every=1) as recorder:
-        recorder.iteration(record(norm=0.25), dict, lambda: 268.5)
+        recorder.iteration(record(norm=0.25), Seen({}, 268.5))
     assert "‖r‖ 2.50e-01" in stream.getvalue()
     assert "268.5" in stream.getvalue()

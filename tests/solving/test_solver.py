@@ -378,7 +378,7 @@ class Interrupting(Observer):
     def stage_started(self, name, smoothing, index):
         self.now = (name, smoothing)
 
-    def iteration(self, record, blocks, cost):
+    def iteration(self, record, look):
         if self.now == self.stage and record["iteration"] == 2:
             raise KeyboardInterrupt
 
@@ -396,6 +396,19 @@ def test_an_interrupted_solve_keeps_what_it_had(stage):
     assert result.stages[-1].status is Status.INTERRUPTED
     assert result.stages[-1].n_iterations == 2
     assert result.solution is observer.reported is not None
+
+
+@pytest.mark.parametrize(("seconds", "stages"), [(1e-9, 1), (0.4, None)])
+def test_a_budget_ends_a_solve_that_keeps_what_it_had(seconds, stages):
+    result = Solver(cpu_seconds=seconds).solve(problem("earth_mars"))
+    assert not result.certified
+    assert not result.interrupted
+    assert result.stages[-1].status is Status.BUDGET
+    assert Status.BUDGET.value in result.message
+    assert result.solution is not None
+    assert seconds < result.cpu_seconds < seconds + 3.0  # the iteration under way is ended
+    if stages is not None:
+        assert (len(result.stages), result.stages[0].n_iterations, result.n_starts) == (stages, 1, 1)
 
 
 def test_no_bounds_means_no_smoothing_and_one_stage():
