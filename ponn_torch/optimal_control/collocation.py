@@ -16,8 +16,8 @@ from functools import cached_property
 
 import torch
 from torch import Tensor
-from torch.func import vjp, vmap
 
+from ponn_torch.numerics.autodiff import row_gradients
 from ponn_torch.numerics.linalg import ArrowJacobian
 from ponn_torch.optimal_control.control_laws import Regime
 from ponn_torch.optimal_control.discretisation import Discretisation
@@ -337,18 +337,9 @@ class Collocation:
         batch = times.shape[:-1]
         if not self.n_extra:
             return times[..., :0], times.new_zeros(*batch, 0, self.n_shared)
-        value, pull, *_ = vjp(self._extra_rows, knots, times, multipliers)
-        seeds = torch.eye(self.n_extra, dtype=times.dtype, device=times.device)
-        by_knots, by_times, by_multipliers = vmap(lambda seed: pull(seed.expand_as(value)))(seeds)
-        jacobian = torch.cat(
-            [
-                by_knots.flatten(-2)[..., self.free_knots],
-                by_times[..., self.free_times],
-                by_multipliers,
-            ],
-            -1,
-        )
-        return value, jacobian.movedim(0, -2)
+        value, (by_knots, by_times, by_multipliers) = row_gradients(self._extra_rows, knots, times, multipliers)
+        by_free = [by_knots.flatten(-2)[..., self.free_knots], by_times[..., self.free_times], by_multipliers]
+        return value, torch.cat(by_free, -1).movedim(0, -2)
 
     def blocks(self, residual: Tensor) -> Mapping[str, Tensor]:
         """Norm of each equation (...,) by name, from r (..., R): the chains' last entries, switching, terminal."""

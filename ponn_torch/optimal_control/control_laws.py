@@ -19,7 +19,8 @@ from typing import Any, NamedTuple, Protocol
 
 import torch
 from torch import Tensor
-from torch.func import grad
+
+from ponn_torch.numerics.autodiff import gradients
 
 Hamiltonian = Callable[..., Tensor]
 
@@ -218,7 +219,9 @@ class Unconstrained:
         return self
 
     def minimise(self, h: Hamiltonian, p: Any, like: Tensor, regime: Regime) -> Minimiser:
-        gradient = grad(lambda u: h(**{self.name: u}).sum())
+        def gradient(u: Tensor) -> Tensor:
+            return gradients(lambda u: h(**{self.name: u}), u)[0]
+
         zero = torch.zeros_like(like).expand(*like.shape[:-1], self.size).contiguous()
         at_zero = gradient(zero)
         units = torch.eye(self.size, dtype=like.dtype, device=like.device)
@@ -269,6 +272,12 @@ class Bounded:
         reward = smoothing * self.regulariser.penalty(eta) + self.switching_level * eta
         return (self.cost_rate * (high - low) * reward).sum(-1, keepdim=True)
 
+    def _scaled(self, gain: Tensor) -> Tensor:
+        """S from a decrease of H per unit of control."""
+        if self.cost_rate is None:
+            raise ValueError(f"{self.name}: cost_rate = None; allowed: a number (`adapted` finds one)")
+        return gain / self.cost_rate
+
     def _switching(self, at_lower: Tensor, at_upper: Tensor) -> Tensor:
         return torch.cat([at_lower, at_upper], -1) if self.curved else at_lower
 
@@ -315,13 +324,16 @@ class ThrustBall(Bounded):
 
     def minimise(self, h: Hamiltonian, p: Any, like: Tensor, regime: Regime) -> Minimiser:
         low, high = self.bounds(p)
-        slopes = grad(lambda vector, magnitude: h(**self._controls(vector, magnitude)).sum(), argnums=(0, 1))
+
+        def slopes(vector: Tensor, magnitude: Tensor) -> tuple[Tensor, ...]:
+            return gradients(lambda vector, magnitude: h(**self._controls(vector, magnitude)), vector, magnitude)
+
         zero = torch.zeros_like(like)
         vector = zero.expand(*like.shape[:-1], self.size)
         primer, slope = slopes(vector, zero + low)
         norm = torch.sqrt((primer * primer).sum(-1, keepdim=True))
-        at_lower = (norm - slope) / self.cost_rate
-        at_upper = (norm - slopes(vector, zero + high)[1]) / self.cost_rate if self.curved else at_lower
+        at_lower = self._scaled(norm - slope)
+        at_upper = self._scaled(norm - slopes(vector, zero + high)[1]) if self.curved else at_lower
         fraction = _fraction(at_lower, at_upper, self.curved, self, regime)
         magnitude = low + (high - low) * fraction
         control = self._controls(-magnitude * primer / norm, magnitude)
@@ -349,7 +361,10 @@ class Box(Bounded):
         low, high = (torch.as_tensor(b, dtype=one.dtype) for b in self.bounds(p))
         if not bool((low < high).all()):
             raise ValueError(f"{self.name}: minimum = {self.minimum}, maximum = {self.maximum}; minimum < maximum")
-        gradient = grad(lambda u: h(**{self.name: u}).sum())
+
+        def gradient(u: Tensor) -> Tensor:
+            return gradients(lambda u: h(**{self.name: u}), u)[0]
+
         zero = torch.zeros_like(one).expand(*one.shape[:-1], self.size).contiguous()
         base, changes, scale = gradient(zero + low), [], 0.0
         for i in range(self.size):
@@ -373,9 +388,12 @@ class Box(Bounded):
 
     def minimise(self, h: Hamiltonian, p: Any, like: Tensor, regime: Regime) -> Minimiser:
         low, high = self.bounds(p)
-        gradient = grad(lambda u: h(**{self.name: u}).sum())
+
+        def gradient(u: Tensor) -> Tensor:
+            return gradients(lambda u: h(**{self.name: u}), u)[0]
+
         zero = torch.zeros_like(like).expand(*like.shape[:-1], self.size)
-        at_lower = -gradient(zero + low) / self.cost_rate
-        at_upper = -gradient(zero + high) / self.cost_rate if self.curved else at_lower
+        at_lower = self._scaled(-gradient(zero + low))
+        at_upper = self._scaled(-gradient(zero + high)) if self.curved else at_lower
         fraction = _fraction(at_lower, at_upper, self.curved, self, regime)
         return Minimiser({self.name: low + (high - low) * fraction}, self._switching(at_lower, at_upper), fraction)

@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
-from torch.func import vjp, vmap
 
 from ponn_torch.numerics.linalg import ArrowJacobian
 from ponn_torch.optimal_control.discretisation import Discretisation
@@ -54,20 +53,10 @@ def linearise(collocation: Collocation, xi: Tensor) -> tuple[Tensor, ArrowJacobi
 
 def _rates_and_slopes(collocation: Collocation, t: Tensor, w: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """F (..., 2n) at the nodes and, for the equations in use, ∂F/∂t (..., rows) and ∂F/∂w (..., rows, 2n)."""
-    bvp, shape = collocation.bvp, w.shape
-    setting = collocation.point_setting(shape[:-1])
+    shape, rows = w.shape, collocation.discretisation.last_columns.tolist()
     points = t.reshape(-1, 1), w.reshape(-1, shape[-1])
-    rates, pull, *_ = vjp(lambda t, w: bvp.rates(t, w, setting), *points)
-    rows = collocation.discretisation.last_columns
-    if not len(rows):
-        return rates.view(shape), w[..., :0], w.unsqueeze(-2)[..., :0, :]
-    seeds = torch.eye(shape[-1], dtype=w.dtype, device=w.device)[rows]
-    by_t, by_w = vmap(lambda seed: pull(seed.expand_as(rates)))(seeds)
-    return (
-        rates.view(shape),
-        by_t[..., 0].movedim(0, -1).reshape(*shape[:-1], len(rows)),
-        by_w.movedim(0, -2).reshape(*shape[:-1], len(rows), shape[-1]),
-    )
+    rates, by_t, by_w = collocation.bvp.linearised_rates(*points, collocation.point_setting(shape[:-1]), rows)
+    return rates.view(shape), by_t.view(*shape[:-1], len(rows)), by_w.view(*shape[:-1], len(rows), shape[-1])
 
 
 def _by_half_length(

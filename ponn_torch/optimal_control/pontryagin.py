@@ -8,14 +8,14 @@ to the constants c, so the costs, S and the control law stay those of the user's
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
 import torch
 from torch import Tensor
-from torch.func import grad, vjp
 
+from ponn_torch.numerics.autodiff import differentiable, gradients_and_values, pointwise_jacobian
 from ponn_torch.optimal_control.control_laws import INTERIOR, LOWER, UPPER, ControlSet, Minimiser, Regime
 from ponn_torch.optimal_control.problem import Named, OptimalControlProblem, nearest
 
@@ -130,7 +130,8 @@ class BoundaryValueProblem:
         def h(**u: Tensor) -> Tensor:
             return self._hamiltonian(time, x, costates, Named(**u), p)[0]
 
-        return self.law.minimise(h, p, w[..., :1], setting.regime)
+        with differentiable(t, w, *setting.parameters.values()):
+            return self.law.minimise(h, p, w[..., :1], setting.regime)
 
     def rates(self, t: Tensor, w: Tensor, setting: Setting) -> Tensor:
         """F(t, w): scaled rates (..., 2n) of states and costates."""
@@ -141,10 +142,24 @@ class BoundaryValueProblem:
         def h(y: Tensor) -> tuple[Tensor, tuple[Tensor, Tensor]]:
             x, slope = self._psi(y)
             value, rates = self._hamiltonian(time, x, self.conjugate * mu / slope, u, p)
-            return value.sum(), (rates, slope)
+            return value, (rates, slope)
 
-        gradient, (rates, slope) = grad(h, has_aux=True)(w[..., :n])
+        with differentiable(t, w, *setting.parameters.values()):
+            (gradient,), (rates, slope) = gradients_and_values(h, w[..., :n])
         return self.time_unit * torch.cat([rates / slope, -gradient / self.conjugate], -1)
+
+    def linearised_rates(
+        self, t: Tensor, w: Tensor, setting: Setting, rows: Sequence[int]
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """F (n, 2n) at points t (n, 1), w (n, 2n), and ∂F/∂t (n, len(rows)), ∂F/∂w (n, len(rows), 2n) of its rows."""
+        names = list(setting.parameters)
+
+        def rates(t: Tensor, w: Tensor, smoothing: Tensor | None, arcs: Tensor | None, *values: Tensor) -> Tensor:
+            return self.rates(t, w, Setting(Regime(smoothing, arcs), dict(zip(names, values, strict=True))))
+
+        varied = (setting.regime.smoothing, setting.regime.arcs, *setting.parameters.values())
+        value, (by_t, by_w) = pointwise_jacobian(rates, rows, t, w, constants=varied)
+        return value, by_t[..., 0], by_w
 
     def switching(self, t: Tensor, w: Tensor, setting: Setting) -> Tensor:
         """Switching functions (..., m), positive where more control is better."""
@@ -198,7 +213,7 @@ class BoundaryValueProblem:
         x, costates = self.to_physical(w)
         time, rows = t * self.time_unit, []
 
-        def end_function(time: Tensor, x: Tensor) -> tuple[Tensor, Tensor]:
+        def end_function(time: Tensor, x: Tensor) -> tuple[Tensor, tuple[Tensor]]:
             """φ + νᵀψ, which plays the part of the terminal cost, and ψ."""
             total, psi = torch.zeros_like(time[..., 0]), x[..., :0]
             if problem.terminal_cost is not None:
@@ -206,10 +221,10 @@ class BoundaryValueProblem:
             if problem.terminal_manifold is not None:
                 psi = problem.terminal_manifold(time, problem.named(x), p)
                 total = total + self.cost_unit * (multipliers * psi).sum(-1)
-            return total, psi
+            return total, (psi,)
 
-        (_, psi), pull, *_ = vjp(end_function, time, x)
-        phi_t, phi_x = pull((torch.ones_like(time[..., 0]), torch.zeros_like(psi)))
+        with differentiable(t, w, multipliers, *setting.parameters.values()):
+            (phi_t, phi_x), (psi,) = gradients_and_values(end_function, time, x)
         if self.terminal_components:
             index = self.terminal_components
             unit = (self.conjugate / self._psi(w[..., : self.n_states])[1])[..., index]
@@ -224,6 +239,7 @@ class BoundaryValueProblem:
 # -- building --------------------------------------------------------------------------------------------------------
 
 
+@torch.no_grad()
 def pontryagin(
     problem: OptimalControlProblem,
     *,

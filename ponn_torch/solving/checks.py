@@ -8,8 +8,8 @@ from typing import Any
 
 import torch
 from torch import Tensor
-from torch.func import grad
 
+from ponn_torch.numerics.autodiff import gradients
 from ponn_torch.optimal_control.control_laws import INTERIOR, UPPER, Regime
 from ponn_torch.optimal_control.pontryagin import Setting
 from ponn_torch.solving.flight import Flight, arc_knots
@@ -104,7 +104,7 @@ def flown_cost(solution: Solution, flight: Flight) -> float:
 
 
 def _time_slope(solution: Solution, t: Tensor, w: Tensor, setting: Setting) -> Tensor:
-    return grad(lambda time: solution.reference.hamiltonian(time, w, setting).sum())(t)
+    return gradients(lambda time: solution.reference.hamiltonian(time, w, setting), t)[0]
 
 
 def depends_on_time(solution: Solution) -> bool:

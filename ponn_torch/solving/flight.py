@@ -11,8 +11,8 @@ import torch
 from numpy.typing import NDArray
 from scipy.integrate import DOP853
 from torch import Tensor
-from torch.func import grad
 
+from ponn_torch.numerics.autodiff import gradients
 from ponn_torch.numerics.piecewise import PiecewiseChebyshev, approximate
 from ponn_torch.numerics.tracing import trace
 from ponn_torch.optimal_control.control_laws import Regime
@@ -176,7 +176,7 @@ def fly_extremal(solution: Solution, history: list[PiecewiseChebyshev], *, expli
         w = y[: bvp.dimension]
         pieces = [bvp.rates(t, w, setting), bvp.running_cost(t, w, setting)]
         if explicit_time:
-            pieces.append(grad(lambda time: bvp.hamiltonian(time, w, setting).sum())(t))
+            pieces.append(gradients(lambda time: bvp.hamiltonian(time, w, setting), t)[0])
         return torch.cat(pieces)
 
     start = solution.curve.knots[0].detach().double().cpu()

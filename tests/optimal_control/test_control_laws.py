@@ -193,6 +193,7 @@ def throttle_energy(primer: Tensor, curvature: float = 0.5):
 
 
 @given(size=st.floats(0.01, 3.0), minimum=st.sampled_from([0.0, 0.7]))
+@torch.no_grad()
 def test_a_convex_hamiltonian_is_minimised_by_clipping(size, minimum):
     h = throttle_energy(tensor([[0.0, size, 0.0]]))
     law = adapted(ThrustBall("thrust", 2.0, minimum), h, cost_rate=None)
