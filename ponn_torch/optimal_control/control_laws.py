@@ -201,6 +201,7 @@ class Unconstrained:
     def probe(self, one: Tensor) -> dict[str, Tensor]:
         return {self.name: one.expand(*one.shape[:-1], self.size)}
 
+    @torch.no_grad()
     def adapted(self, h: Hamiltonian, cost: Hamiltonian, p: Any, one: Tensor, unit: float) -> Unconstrained:
         # third difference along a generic ray: zero where H is quadratic in u
         ray = [h(**{self.name: k * self.probe(one)[self.name]}) for k in (0.0, 1.0, 2.0, 3.0)]
@@ -308,6 +309,7 @@ class ThrustBall(Bounded):
     def probe(self, one: Tensor) -> dict[str, Tensor]:
         return self._controls(one.expand(*one.shape[:-1], self.size) / self.size**0.5, one)
 
+    @torch.no_grad()
     def adapted(self, h: Hamiltonian, cost: Hamiltonian, p: Any, one: Tensor, unit: float) -> ThrustBall:
         low, high = (torch.as_tensor(b, dtype=one.dtype) for b in self.bounds(p))
         if not bool(((low >= 0) & (low < high)).all()):
@@ -357,6 +359,7 @@ class Box(Bounded):
     def probe(self, one: Tensor) -> dict[str, Tensor]:
         return {self.name: one.expand(*one.shape[:-1], self.size)}
 
+    @torch.no_grad()
     def adapted(self, h: Hamiltonian, cost: Hamiltonian, p: Any, one: Tensor, unit: float) -> Box:
         low, high = (torch.as_tensor(b, dtype=one.dtype) for b in self.bounds(p))
         if not bool((low < high).all()):

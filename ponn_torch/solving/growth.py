@@ -10,7 +10,6 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
-from torch.func import vjp, vmap
 
 from ponn_torch.solving.solution import Solution
 
@@ -39,7 +38,5 @@ def restarts(solution: Solution, most_growth: float = MOST_GROWTH) -> list[tuple
 
 def _slopes(solution: Solution, t: Tensor, w: Tensor, segment: Tensor) -> Tensor:
     """∂F/∂w (m, 2n, 2n) along the curve."""
-    setting = solution.curve.setting(segment)
-    rates, pull, *_ = vjp(lambda w: solution.bvp.rates(t[:, None], w, setting), w)
-    seeds = torch.eye(w.shape[-1], dtype=w.dtype, device=w.device)
-    return torch.nan_to_num(vmap(lambda seed: pull(seed.expand_as(rates))[0])(seeds).movedim(0, -2))
+    by_w = solution.bvp.linearised_rates(t[:, None], w, solution.curve.setting(segment), range(w.shape[-1]))[2]
+    return torch.nan_to_num(by_w)

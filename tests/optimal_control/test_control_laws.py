@@ -250,6 +250,7 @@ def test_every_component_of_a_box_minimises_its_part(regulariser, slopes, seed):
 
 
 @given(slopes=st.lists(st.floats(-5, 5), min_size=2, max_size=2))
+@torch.no_grad()
 def test_a_convex_box_is_clipped_component_by_component(slopes):
     curvatures = tensor([1.0, 4.0])
     h = separable(tensor([slopes]), curvatures)
