@@ -12,6 +12,7 @@ from torch import Tensor, nn
 
 from ponn_torch.ansatz.basis import Chebyshev, LinearBasis
 from ponn_torch.ansatz.constraints import Constraint, SwitchingFunctions, apply, functional_matrix
+from ponn_torch.numerics.linalg import least_squares
 from ponn_torch.numerics.nodes import NodeSet
 
 
@@ -180,15 +181,7 @@ class ConstrainedExpression(nn.Module):
         rest = root[:, None] * (y - self.jet(y.new_zeros(self.size, y.shape[-1]), kappa, z, 0)[..., 0, :, :])
         table = self.tables(z, 0)[0][0]
         if self.n_variables == 1:
-            return _least_squares(root[:, None] * table, rest, ridge)
+            return least_squares(root[:, None] * table, rest, ridge)
         matrix = (root[:, None, None, None] * table).flatten(2).flatten(0, 1)  # rows (n, v), columns (L', u)
-        solution = _least_squares(matrix, rest.flatten(-2).unsqueeze(-1), ridge)
+        solution = least_squares(matrix, rest.flatten(-2).unsqueeze(-1), ridge)
         return solution.squeeze(-1).unflatten(-1, (self.size, self.n_variables))
-
-
-def _least_squares(matrix: Tensor, target: Tensor, ridge: float) -> Tensor:
-    # the SVD and not torch's lstsq, whose drivers for deficient rank exist on the CPU only
-    left, singular, right = torch.linalg.svd(matrix, full_matrices=False)
-    round_off = torch.finfo(matrix.dtype).eps * max(matrix.shape) * singular[0]
-    inverse = torch.where(singular > round_off, singular / (singular**2 + ridge), 0.0)
-    return right.T @ (inverse[:, None] * (left.T @ target))

@@ -15,6 +15,15 @@ import torch
 from torch import Tensor
 
 
+def least_squares(matrix: Tensor, target: Tensor, ridge: float = 0.0) -> Tensor:
+    """The shortest X (..., N, d) with ‖M X − target‖² + ridge ‖X‖² least; singular values below round-off are dropped."""
+    # the SVD and not torch's lstsq, whose drivers for deficient rank exist on the CPU only
+    left, singular, right = torch.linalg.svd(matrix, full_matrices=False)
+    round_off = torch.finfo(matrix.dtype).eps * max(matrix.shape) * singular[0]
+    inverse = torch.where(singular > round_off, singular / (singular**2 + ridge), 0.0)
+    return right.T @ (inverse[:, None] * (left.T @ target))
+
+
 def _cholesky_solve(matrix: Tensor, scale: Tensor, damping: Tensor, right: Tensor) -> Tensor:
     """Solve (M + μ diag(scale²)) X = right by Cholesky of the scaled matrix; NaN where it is not positive definite."""
     inverse = 1.0 / scale
@@ -31,6 +40,21 @@ def _qr_tail(matrix: Tensor, scale: Tensor, damping: Tensor, n_lead: int) -> tup
     rows.diagonal(dim1=-2, dim2=-1).copy_(damping.sqrt() * scale)
     triangle = torch.linalg.qr(torch.cat([matrix, rows], -2), mode="r").R
     return triangle[..., :n_lead, :], triangle[..., n_lead:, n_lead:]
+
+
+def _row_factor(matrix: Tensor, damping: Tensor, method: str) -> Tensor:
+    """Lower triangular C with C Cᵀ = M Mᵀ + μ 1 for a wide M; NaN where that is not positive definite."""
+    one = torch.eye(matrix.shape[-2], dtype=matrix.dtype, device=matrix.device)
+    if method == "qr":
+        below = (damping.sqrt() * one).expand(*matrix.shape[:-1], matrix.shape[-2])
+        return torch.linalg.qr(torch.cat([matrix.mT, below], -2), mode="r").R.mT
+    factor, failed = torch.linalg.cholesky_ex(matrix @ matrix.mT + damping * one)
+    return torch.where((failed != 0)[..., None, None], torch.nan, factor)
+
+
+def _shortest(matrix: Tensor, factor: Tensor, right: Tensor) -> Tensor:
+    """−Mᵀ C⁻ᵀ right."""
+    return -matrix.mT @ torch.linalg.solve_triangular(factor.mT, right, upper=True)
 
 
 def _back_substitute(head: Tensor, n: int) -> Tensor:
@@ -69,6 +93,8 @@ class DenseJacobian:
 
     def solve_damped(self, residual: Tensor, damping: Tensor, scale: Tensor, method: str = "cholesky") -> Tensor:
         """Step p (..., N); μ (...,), D = diag(scale) with scale (..., N)."""
+        if self.matrix.shape[-1] > self.matrix.shape[-2]:
+            return self._by_rows(residual, damping[..., None, None], scale, method)
         return _METHODS[method][0](self, residual, damping.unsqueeze(-1), scale)
 
     def _by_cholesky(self, residual: Tensor, damping: Tensor, scale: Tensor) -> Tensor:
@@ -79,6 +105,13 @@ class DenseJacobian:
         n = self.matrix.shape[-1]
         head, _ = _qr_tail(torch.cat([self.matrix, residual.unsqueeze(-1)], -1), scale, damping, n)
         return _back_substitute(head, n).squeeze(-1)
+
+    def _by_rows(self, residual: Tensor, damping: Tensor, scale: Tensor, method: str) -> Tensor:
+        """For more unknowns than equations: what is factored has the size of the equations."""
+        scaled = self.matrix / scale.unsqueeze(-2)
+        factor = _row_factor(scaled, damping, method)
+        right = torch.linalg.solve_triangular(factor, residual.unsqueeze(-1), upper=False)
+        return _shortest(scaled, factor, right).squeeze(-1) / scale
 
 
 @dataclass(frozen=True)
@@ -140,9 +173,9 @@ class ArrowJacobian:
         return out.scatter_add_(-1, index, segments)[..., :-1]
 
     def column_norms(self) -> Tensor:
-        own, _, shared = self._normal
-        coupled = self._scatter_matrix(shared).diagonal(dim1=-2, dim2=-1) + (self.extra**2).sum(-2)
-        return torch.cat([own.diagonal(dim1=-2, dim2=-1).flatten(-2), coupled], -1).sqrt()
+        own = torch.linalg.vector_norm(self.local, dim=-2).flatten(-2)
+        shared = self._scatter_matrix(self.shared.mT @ self.shared).diagonal(dim1=-2, dim2=-1)
+        return torch.cat([own, (shared + (self.extra**2).sum(-2)).sqrt()], -1)
 
     def gradient(self, residual: Tensor) -> Tensor:
         segments, extra = self._split_rows(residual)
@@ -182,6 +215,8 @@ class ArrowJacobian:
 
     def solve_damped(self, residual: Tensor, damping: Tensor, scale: Tensor, method: str = "cholesky") -> Tensor:
         """Step p (..., N); the segments' own unknowns are eliminated first: K small factorisations, one of size G."""
+        if self.local.shape[-1] > self.local.shape[-2]:
+            return self._by_rows(residual, damping[..., None, None], scale, method)
         return _METHODS[method][1](self, residual, damping[..., None, None], scale)
 
     def _split_columns(self, vector: Tensor) -> tuple[Tensor, Tensor]:
@@ -213,6 +248,27 @@ class ArrowJacobian:
         known = head[..., n:-1] @ self._gather(step).unsqueeze(-1) + head[..., -1:]
         inner = -torch.linalg.solve_triangular(head[..., :n], known, upper=True)
         return torch.cat([inner.flatten(-3), step], -1)
+
+    def _by_rows(self, residual: Tensor, damping: Tensor, scale: Tensor, method: str) -> Tensor:
+        """For more unknowns than equations in a segment: what is factored has the size of the equations.
+
+        With the own unknowns eliminated, μ (S s + r)ᵀ (L D⁻² Lᵀ + μ 1)⁻¹ (S s + r) is left for the shared ones s.
+        """
+        scale_own, scale_shared = self._split_columns(scale)
+        segments, extra = self._split_rows(residual)
+        scaled = self.local / scale_own.unsqueeze(-2)
+        factor = _row_factor(scaled, damping.unsqueeze(-1), method)
+        coupled = torch.cat([self.shared, segments.unsqueeze(-1)], -1)
+        coupled = torch.linalg.solve_triangular(factor, coupled, upper=False)
+        left_over = torch.cat([self._spread_columns(coupled[..., :-1]), coupled[..., -1:]], -1).flatten(-3, -2)
+        root = damping.clamp_min(torch.finfo(damping.dtype).tiny).sqrt()
+        # the extra rows first: Householder reflections keep the digits of rows in descending size
+        rows = torch.cat([torch.cat([self.extra, extra.unsqueeze(-1)], -1) / root, left_over], -2)
+        g = self.n_shared
+        step = _back_substitute(_qr_tail(rows, scale_shared, torch.ones_like(damping[..., 0]), g)[0], g).squeeze(-1)
+        known = coupled[..., :-1] @ self._gather(step).unsqueeze(-1) + coupled[..., -1:]
+        inner = _shortest(scaled, factor, known).squeeze(-1) / scale_own
+        return torch.cat([inner.flatten(-2), step], -1)
 
 
 Jacobian = DenseJacobian | ArrowJacobian

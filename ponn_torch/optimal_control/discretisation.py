@@ -13,9 +13,11 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
-from ponn_torch.ansatz.basis import LinearBasis
+from ponn_torch.ansatz.basis import FreeFunction, LinearBasis
 from ponn_torch.ansatz.constraints import SwitchingFunctions, hermite
+from ponn_torch.ansatz.networks import MLP
 from ponn_torch.numerics.nodes import NodeSet, legendre_moments
+from ponn_torch.optimal_control.deep_expressions import DeepExpressions
 from ponn_torch.optimal_control.expressions import Expressions, LinearExpressions
 from ponn_torch.optimal_control.pontryagin import BoundaryValueProblem, Chain, probe_points, probe_settings
 
@@ -82,7 +84,7 @@ class Discretisation:
     """Basis, nodes and form, tabulated for the chains of a boundary value problem; shared by all its residuals."""
 
     bvp: BoundaryValueProblem
-    basis: LinearBasis
+    basis: FreeFunction
     nodes: NodeSet
     form: Form = field(default_factory=Strong)
     conditioning: str = "orthonormal"
@@ -118,8 +120,17 @@ class Discretisation:
 
     @cached_property
     def expressions(self) -> Expressions:
-        """The constrained expressions of all chains, around the free function."""
-        return LinearExpressions(self, self.basis)
+        """The constrained expressions of all chains, around the free function.
+
+        Raises:
+            TypeError: a free function that is neither a LinearBasis nor an MLP.
+        """
+        match self.basis:
+            case LinearBasis():
+                return LinearExpressions(self, self.basis)
+            case MLP():
+                return DeepExpressions(self, self.basis)
+        raise TypeError(f"basis = {type(self.basis).__name__}; allowed: a LinearBasis or an MLP")
 
     @property
     def n_own(self) -> int:

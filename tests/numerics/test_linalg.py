@@ -45,6 +45,9 @@ JACOBIANS = {
     "arrow_of_neighbours": lambda batch: arrow(batch, index=NEIGHBOURS),
     "arrow_without_extra_rows": lambda batch: arrow(batch, n_extra=0),
     "arrow_without_own_columns": lambda batch: arrow(batch, n_own=0),
+    "wide": lambda batch: dense(batch, columns=19),
+    "wide_arrow": lambda batch: arrow(batch, n_own=11),
+    "wide_arrow_without_extra_rows": lambda batch: arrow(batch, n_own=11, n_extra=0),
 }
 
 
@@ -147,6 +150,16 @@ def test_norms_gradient_and_product_are_those_of_the_whole_matrix(name, batch):
     assert relative(jacobian.column_norms(), matrix.norm(dim=-2)) < 1e-13
     assert relative(jacobian.gradient(residual), (matrix.mT @ residual.unsqueeze(-1)).squeeze(-1)) < 1e-13
     assert relative(jacobian.apply(step), (matrix @ step.unsqueeze(-1)).squeeze(-1)) < 1e-13
+
+
+@pytest.mark.parametrize("make", [lambda: dense(columns=40), lambda: arrow(n_own=20)])
+def test_with_more_unknowns_than_equations_little_damping_meets_them_all_by_the_shortest_step(make):
+    jacobian = make()
+    matrix = jacobian.dense()
+    residual, _, scale = data(jacobian, ())
+    step = jacobian.solve_damped(residual, torch.tensor(1e-26, dtype=torch.float64), scale, "qr")
+    assert relative(matrix @ step, -residual) < 1e-12
+    assert relative(scale * step, -torch.linalg.pinv(matrix / scale) @ residual) < 1e-11
 
 
 def test_an_arrow_without_coupling_is_block_diagonal():
