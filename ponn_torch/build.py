@@ -15,7 +15,7 @@ import torch
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 
-from ponn_torch.ansatz.basis import LinearBasis
+from ponn_torch.ansatz.basis import FreeFunction
 from ponn_torch.optim.base import Optimizer
 from ponn_torch.optim.chain import Chain
 from ponn_torch.optimal_control.pontryagin import pontryagin
@@ -173,7 +173,7 @@ def _solver(node: dict[str, Any], top: Mapping[str, Any]) -> Solver:
     hints = types_of(Solver)
     ansatz, nodes = _section(node, "ansatz"), _section(node, "nodes")
     fields: dict[str, Any] = {"conditioning": ansatz.pop("conditioning", "columns")}
-    fields["basis"] = value_of(ansatz, LinearBasis, "ansatz")
+    fields["basis"] = value_of(ansatz, FreeFunction, "ansatz")
     for key, name in (("kind", "node_kind"), ("n_nodes", "n_nodes")):
         if key not in nodes:
             raise ConfigError(f"nodes.{key}: missing; allowed: {KINDS[hints[name]]}")

@@ -18,6 +18,7 @@ from ponn_torch.optimal_control.problem import nearest
 ROOMS = (
     "ponn_torch.problems",
     "ponn_torch.ansatz.basis",
+    "ponn_torch.ansatz.networks",
     "ponn_torch.optimal_control.discretisation",
     "ponn_torch.optim",
     "ponn_torch.solving",

@@ -13,7 +13,8 @@ import torch
 from torch import Tensor
 
 import ponn_torch.problems
-from ponn_torch.ansatz.basis import Chebyshev, GaussianRBF, Legendre, LinearBasis, RandomFeatures
+from ponn_torch.ansatz.basis import Chebyshev, FreeFunction, GaussianRBF, Legendre, LinearBasis, RandomFeatures
+from ponn_torch.ansatz.networks import MLP, FrozenMLP
 from ponn_torch.numerics.nodes import make_nodes
 from ponn_torch.optim.base import Optimizer, Stopping
 from ponn_torch.optim.chain import Chain
@@ -50,6 +51,14 @@ ANSATZES: dict[str, Callable[[int], LinearBasis]] = {
     "elm_sigmoid": lambda size: RandomFeatures(size, "sigmoid"),
     "elm_gaussian": lambda size: RandomFeatures(size, "gaussian"),
     "gaussian_rbf": lambda size: GaussianRBF(size, 0.25 * size),
+    "frozen_mlp": lambda size: FrozenMLP((12, size)),
+}
+NETWORKS: dict[str, Callable[[int], MLP]] = {
+    "mlp": lambda size: MLP((8, size)),
+    "mlp_sine": lambda size: MLP((8, size), "sin", adaptive_slope=True),
+    "residual_mlp": lambda size: MLP((size, size), "gelu", residual=True),
+    "fourier_mlp": lambda size: MLP((8, size), n_frequencies=2),
+    "mlp_per_variable": lambda size: MLP((4, size), shared=False),
 }
 
 # -- problems ------------------------------------------------------------------------------------------------
@@ -122,7 +131,7 @@ def collocation(
     n_segments: int = 1,
     smoothing: float | None = None,
     form: Form | None = None,
-    basis: Callable[[int], LinearBasis] = Chebyshev,
+    basis: Callable[[int], FreeFunction] = Chebyshev,
     kind: str = "legendre_gauss",
     conditioning: str = "columns",
 ) -> Collocation:

@@ -120,10 +120,12 @@ TINY = [
     "refinement=none",
     "record=minimal",
 ]
+MLPS = [option for group, option in OPTIONS if group == "ansatz" and "mlp" in option]
 # What stands in the way of a tiny budget, per group or option.
 INSTEAD = {
     "ansatz": ["ansatz.size=8"],
     "rbf": ["ansatz.centres=8"],
+    **{name: ["ansatz.hidden=[6,6]"] for name in MLPS},
     "optimizer": ["optimizer.stopping.max_iterations=2"],
     "quiet": ["record.figures=false", "record.tensorboard=false"],
     "refinement": [],
@@ -142,8 +144,10 @@ INSTEAD = {
     ],
 }
 # Settings of a tiny budget that an option does not have.
-ABSENT = {"rbf": "ansatz.size", "none": "refinement.max_rounds"} | dict.fromkeys(
-    ("adam_lbfgs", "adam_lm", "lm_output"), "optimizer.stopping.max_iterations"
+ABSENT = (
+    {"none": "refinement.max_rounds"}
+    | dict.fromkeys(("rbf", *MLPS), "ansatz.size")
+    | dict.fromkeys(("adam_lbfgs", "adam_lm", "lm_output"), "optimizer.stopping.max_iterations")
 )
 
 

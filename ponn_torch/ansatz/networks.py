@@ -80,7 +80,7 @@ class MLP(FreeFunction):
 
     def __init__(
         self,
-        hidden: Sequence[int] = (32, 64),
+        hidden: Sequence[int] = (20, 40),
         activation: str = "tanh",
         *,
         residual: bool = False,
@@ -265,7 +265,7 @@ class FrozenMLP(LinearBasis):
 
     def __init__(
         self,
-        hidden: Sequence[int] = (32, 64),
+        hidden: Sequence[int] = (20, 40),
         activation: str = "tanh",
         *,
         residual: bool = False,

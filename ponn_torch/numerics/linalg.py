@@ -16,7 +16,7 @@ from torch import Tensor
 
 
 def least_squares(matrix: Tensor, target: Tensor, ridge: float = 0.0) -> Tensor:
-    """The shortest X (..., N, d) with ‖M X − target‖² + ridge ‖X‖² least; singular values below round-off are dropped."""
+    """The shortest X (..., N, d) of least ‖M X − target‖² + ridge ‖X‖²; singular values below round-off are dropped."""
     # the SVD and not torch's lstsq, whose drivers for deficient rank exist on the CPU only
     left, singular, right = torch.linalg.svd(matrix, full_matrices=False)
     round_off = torch.finfo(matrix.dtype).eps * max(matrix.shape) * singular[0]

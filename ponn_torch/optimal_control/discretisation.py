@@ -125,11 +125,10 @@ class Discretisation:
         Raises:
             TypeError: a free function that is neither a LinearBasis nor an MLP.
         """
-        match self.basis:
-            case LinearBasis():
-                return LinearExpressions(self, self.basis)
-            case MLP():
-                return DeepExpressions(self, self.basis)
+        if isinstance(self.basis, LinearBasis):
+            return LinearExpressions(self, self.basis)
+        if isinstance(self.basis, MLP):
+            return DeepExpressions(self, self.basis)
         raise TypeError(f"basis = {type(self.basis).__name__}; allowed: a LinearBasis or an MLP")
 
     @property

@@ -15,7 +15,7 @@ from typing import ClassVar, Protocol
 import torch
 from torch import Tensor
 
-from ponn_torch.ansatz.basis import Legendre, LinearBasis
+from ponn_torch.ansatz.basis import FreeFunction, Legendre
 from ponn_torch.numerics.nodes import make_nodes
 from ponn_torch.optim.base import Callback, OptimizeResult, Stopping
 from ponn_torch.optim.least_squares import LevenbergMarquardt
@@ -65,7 +65,7 @@ class Segmentation:
 
     Attributes:
         n_neurons, n_nodes: size of a segment. n_segments: how many the first round has, about.
-        basis: the free function of a segment (Legendre by default).
+        basis: the free function of a segment, a network with its own size, or what makes one of n_neurons.
         residual_tolerance: ‖r‖ above which a round has failed.
         off_node_tolerance: largest |ẇ − F| off the nodes, scaled, weighted by the segment's share of the time.
     """
@@ -84,11 +84,13 @@ class Segmentation:
     )
     damping: float = 1e-8
     linear_solver: str = "cholesky"
-    basis: Callable[[int], LinearBasis] = Legendre
+    basis: FreeFunction | Callable[[int], FreeFunction] = Legendre
 
     def discretisation(self, bvp: BoundaryValueProblem) -> Discretisation:
         nodes = make_nodes("legendre_gauss", self.n_nodes, dtype=bvp.unit.dtype, device=bvp.unit.device)
-        return Discretisation(bvp, self.basis(self.n_neurons), nodes, conditioning="orthonormal")
+        basis = self.basis if isinstance(self.basis, FreeFunction) else self.basis(self.n_neurons)
+        basis = basis.to(dtype=bvp.unit.dtype, device=bvp.unit.device)
+        return Discretisation(bvp, basis, nodes, conditioning="orthonormal")
 
     def solve(
         self, collocation: Collocation, start: Curve, callback: MakeCallback | None

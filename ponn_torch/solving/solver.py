@@ -13,7 +13,7 @@ from dataclasses import dataclass, field, replace
 import torch
 from torch import Tensor
 
-from ponn_torch.ansatz.basis import Chebyshev, LinearBasis
+from ponn_torch.ansatz.basis import Chebyshev, FreeFunction
 from ponn_torch.numerics.nodes import make_nodes
 from ponn_torch.optim.base import (
     Callback,
@@ -70,7 +70,7 @@ class Solver:
     """All choices of a solve; every part can be exchanged.
 
     Attributes:
-        basis: free function of the smoothed stages (its size is the number of neurons per chain).
+        basis: free function of the smoothed stages: a basis (its size is the number of neurons per chain) or a network.
         node_kind, n_nodes: collocation points per segment. form: strong or weak residual. n_segments: fixed segments.
         optimizer, continuation, guess: of the smoothed stages. refinement: None to stop at the smoothed solution.
         n_starts: random starts to try at most; start i of seed s uses the random stream 1000 s + i.
@@ -81,7 +81,7 @@ class Solver:
         cpu_seconds: budget of the whole solve, certificates apart; what there is when it is spent is kept.
     """
 
-    basis: LinearBasis = field(default_factory=lambda: Chebyshev(30))
+    basis: FreeFunction = field(default_factory=lambda: Chebyshev(30))
     node_kind: str = "legendre_gauss"
     n_nodes: int = 60
     form: Form = field(default_factory=Strong)

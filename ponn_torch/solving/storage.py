@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from ponn_torch import __version__
-from ponn_torch.ansatz.basis import LinearBasis
+from ponn_torch.ansatz.basis import FreeFunction
 from ponn_torch.numerics.nodes import NodeSet
 from ponn_torch.optimal_control.collocation import Collocation
 from ponn_torch.optimal_control.control_laws import Regime
@@ -134,16 +134,16 @@ def _make_problem(saved: dict[str, Any], folder: Path) -> OptimalControlProblem:
     return load_problem(saved["reference"], **saved["arguments"])
 
 
-def _describe_basis(basis: LinearBasis) -> dict[str, Any]:
+def _describe_basis(basis: FreeFunction) -> dict[str, Any]:
     """Class path and arguments."""
     return {"class": f"{type(basis).__module__}:{type(basis).__qualname__}", "arguments": basis.arguments}
 
 
-def _make_basis(saved: dict[str, Any], buffers: dict[str, Tensor], dtype: torch.dtype) -> LinearBasis:
+def _make_basis(saved: dict[str, Any], buffers: dict[str, Tensor], dtype: torch.dtype) -> FreeFunction:
     module, _, name = saved["class"].partition(":")
     cls = getattr(importlib.import_module(module), name, None)
-    if not (isinstance(cls, type) and issubclass(cls, LinearBasis)):
-        raise ValueError(f"basis class = {saved['class']!r}; allowed: subclasses of LinearBasis")
+    if not (isinstance(cls, type) and issubclass(cls, FreeFunction)):
+        raise ValueError(f"basis class = {saved['class']!r}; allowed: subclasses of FreeFunction")
     basis = cls(**saved["arguments"]).to(dtype)
     basis.load_state_dict(buffers)
     return basis

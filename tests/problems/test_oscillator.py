@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import cmath
+import itertools
 import math
 
 import pytest
@@ -11,7 +12,6 @@ from hypothesis import strategies as st
 
 from ponn_torch.problems.oscillator import oscillator
 from ponn_torch.solving.solver import Solver
-import itertools
 
 QUARTER = math.pi / 2
 

@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import torch
 
-from ponn_torch.ansatz.basis import Chebyshev, LinearBasis
+from ponn_torch.ansatz.basis import Chebyshev, FreeFunction
 from ponn_torch.numerics.nodes import make_nodes
 from ponn_torch.optim.base import Stopping
 from ponn_torch.optim.least_squares import LevenbergMarquardt
@@ -149,7 +149,7 @@ def solve(
     problem: OptimalControlProblem,
     guess: Sequence[Sequence[float]],
     *,
-    basis: LinearBasis | None = None,
+    basis: FreeFunction | None = None,
     n_nodes: int = 20,
     switches: Sequence[float] = (),
     arcs: Sequence[int] | None = None,

@@ -13,12 +13,15 @@ import numpy as np
 import pytest
 import torch
 from analytic import minimum_energy, minimum_time, soft_end, solve, solve_minimum_time, solve_saturated
+from helpers import random
 
 from ponn_torch.ansatz.basis import Chebyshev, GaussianRBF, Legendre, RandomFeatures
+from ponn_torch.ansatz.networks import MLP, FrozenMLP
 from ponn_torch.optimal_control.control_laws import REGULARISERS, Regime, make_regulariser
 from ponn_torch.optimal_control.curve import Curve
 from ponn_torch.optimal_control.problem import ProblemOrigin
 from ponn_torch.optimal_control.references import load_problem
+from ponn_torch.solving.guess import project
 from ponn_torch.solving.solution import Samples, Solution
 
 ANALYTIC = Path(__file__).with_name("analytic.py")
@@ -151,6 +154,12 @@ def test_a_batch_is_refused(smoothed_landing):
 
 def test_a_loaded_solution_gives_the_same_bits_in_a_fresh_process(smoothed_landing, split_landing, tmp_path):
     solutions = {"smoothed": smoothed_landing, "split": split_landing}
+    networks = [MLP((6, 9), "silu", adaptive_slope=True, seed=4), MLP((7, 7), residual=True, shared=False)]
+    for network in networks:
+        disc = replace(smoothed_landing.curve.collocation.discretisation, basis=network)
+        collocation = replace(smoothed_landing.curve.collocation, discretisation=disc)
+        xi = project(collocation, smoothed_landing.curve)
+        solutions[f"deep_{network.shared}"] = Solution(Curve(collocation, xi + 1e-3 * random(len(xi))))
     for name, solution in solutions.items():
         solution.save(tmp_path / name)
     command = [sys.executable, "-c", LOAD, *solutions]
@@ -170,6 +179,8 @@ BASES = {
     "random_tanh": (RandomFeatures(12, "tanh", seed=3), "orthonormal"),
     "random_sin": (RandomFeatures(12, "sin", weight_range=(-9, 9), bias_range=(-1, 1)), "columns"),
     "rbf": (GaussianRBF(9, 1.7), "none"),
+    "mlp": (MLP((6, 9)), "none"),
+    "frozen_mlp": (FrozenMLP((6, 9), seed=5), "orthonormal"),
 }
 
 
