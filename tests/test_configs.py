@@ -134,6 +134,7 @@ INSTEAD = {
     "ladder": ["continuation.values=[1.0,0.1]"],
     "polar": ["problem=earth_mars"],
     "split": ["refinement.max_rounds=1", "refinement.stopping.max_iterations=2"],
+    "two_loop": ["refinement.max_rounds=1", "refinement.stopping.max_iterations=2"],
     "subdivide": ["refinement.max_rounds=1", "refinement.stopping.max_iterations=2"],
     "custom": [REFERENCE],
     "adam_lbfgs": [f"optimizer.parts.{i}.stopping.max_iterations=2" for i in (0, 1)],
