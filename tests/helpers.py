@@ -33,6 +33,7 @@ OPTIMIZERS: dict[str, Callable[[Stopping], Optimizer]] = {
     "levenberg_marquardt_qr": lambda stopping: LevenbergMarquardt(stopping, linear_solver="qr"),
     "levenberg_marquardt_more": lambda stopping: LevenbergMarquardt(stopping, scaling="more"),
     "levenberg_marquardt_factor": lambda stopping: LevenbergMarquardt(stopping, update=4.0),
+    "levenberg_marquardt_geodesic": lambda stopping: LevenbergMarquardt(stopping, geodesic=True),
     "gauss_newton": GaussNewton,
     "scipy_trf": lambda stopping: ScipyLeastSquares("trf", stopping),
     "scipy_lm": lambda stopping: ScipyLeastSquares("lm", stopping),

@@ -56,6 +56,8 @@ def identity(norms: Tensor, previous: Tensor | None) -> Tensor:
 SCALINGS = {"marquardt": marquardt, "more": more, "identity": identity}
 
 
+AHEAD = 0.1  # of a step, where the curvature along it is read off
+
 # -- Levenberg–Marquardt ---------------------------------------------------------------------------------------------
 
 
@@ -80,6 +82,8 @@ class LevenbergMarquardt:
         damping: first μ, relative to D² (1e-3 from a random start, 1e-8 near a solution).
         scaling: one of SCALINGS. linear_solver: ``cholesky`` (fast) or ``qr`` (digits).
         update: ``nielsen`` (gain ratio), or a number > 1: the constant factor of the classical rule.
+        geodesic: add half the acceleration along the step where that is short (Transtrum and Sethna 2012): one more
+            residual and solve a step, for residuals that curve in their unknowns, as a deep network's do.
     """
 
     stopping: Stopping = field(default_factory=Stopping)
@@ -89,6 +93,7 @@ class LevenbergMarquardt:
     update: str | float = "nielsen"
     smallest_damping: float = 1e-15
     largest_damping: float = 1e12
+    geodesic: bool = False
 
     def __post_init__(self) -> None:
         _check_solver(self.linear_solver)
@@ -140,6 +145,13 @@ class LevenbergMarquardt:
         cost, tiny = state.r.square().sum(-1), torch.finfo(xi.dtype).tiny
         step = jacobian.solve_damped(r, damping, scale, self.linear_solver)
         trial = xi + step
+        if self.geodesic:
+            ahead = residual.residual(xi + AHEAD * step)
+            # J a = −r_vv, the second derivative of r along the step v
+            curvature = (2 / AHEAD) * ((ahead - r) / AHEAD - jacobian.apply(step))
+            half = jacobian.solve_damped(0.5 * curvature, damping, scale, self.linear_solver)
+            short = 2 * (scale * half).norm(dim=-1) <= 0.75 * (scale * step).norm(dim=-1)  # NaN is not short
+            trial = trial + torch.where(short.unsqueeze(-1), half, 0.0)
         trial_r = residual.residual(trial)
         trial_cost = trial_r.square().sum(-1)
         accepted = running & (trial_cost < cost)  # NaN compares false: a non-finite step is rejected

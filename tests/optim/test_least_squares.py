@@ -542,3 +542,22 @@ def test_past_tolerance_holds_for_a_start_below_the_tolerance_too():
     stopping = Stopping(tolerance=1e-3, past_tolerance=True)
     assert float(LevenbergMarquardt(stopping).run(_ArcTangent(), start).norm) < 1e-8
     assert LevenbergMarquardt(Stopping(tolerance=1e-3)).run(_ArcTangent(), start).n_iterations == 0
+
+
+# -- geodesic acceleration -------------------------------------------------------------------------------------------
+
+
+def test_an_accelerated_step_has_half_the_second_derivative_along_it():
+    function = CLASSICS["exponential_fit"][0]
+    start, damping = torch.tensor([1.8, 1.2, 0.4], dtype=torch.float64), 1e-2
+    stopping = Stopping(tolerance=0.0, max_iterations=1)
+    result = LevenbergMarquardt(stopping, damping, geodesic=True).run(Pointwise(function), start)
+    r, matrix = function(start), jacfwd(function)(start)
+    normal = matrix.T @ matrix
+    damped = normal + damping * torch.diag(normal.diagonal())
+    step = -torch.linalg.solve(damped, matrix.T @ r)
+    second = jacfwd(jacfwd(lambda s: function(start + s * step)))(torch.tensor(0.0, dtype=torch.float64))
+    acceleration = -torch.linalg.solve(damped, matrix.T @ second)
+    assert 0.01 < float(acceleration.norm() / step.norm()) < 0.5
+    # the second derivative is read off at a tenth of the step
+    assert relative(result.xi - start, step + 0.5 * acceleration) < 0.05 * float(acceleration.norm() / step.norm())
