@@ -42,24 +42,31 @@ class Curve:
         interior = self.times[1:-1].contiguous()
         return torch.searchsorted(interior, t.contiguous(), right=True)
 
-    def _jets(self, z: Tensor, segment: int) -> list[Tensor]:
-        """Per group the derivatives in z (d, q+1, m) at z (m,) of one segment."""
-        h = (self.times[1:] - self.times[:-1]) / 2
-        kappas, _ = self.collocation.kappas(self.unknowns, h)
-        expressions, weights = self.collocation.discretisation.expressions, self.unknowns.weights
-        return expressions.jets_at(z, weights[segment], [kappa[segment] for kappa in kappas])
+    def _at(self, z: Tensor, which: int | slice) -> tuple[Tensor, Tensor, Tensor]:
+        """(t, w, ẇ) at z (m,) of one segment, or of several with a leading axis."""
+        disc, unknowns = self.collocation.discretisation, self.unknowns
+        half = (self.times[1:] - self.times[:-1]) / 2
+        kappas, _ = self.collocation.kappas(unknowns, half)
+        jets = disc.expressions.jets_at(z, unknowns.weights[which], [kappa[which] for kappa in kappas])
+        h = half[which]
+        w = self.xi.new_zeros(*h.shape, len(z), self.collocation.bvp.dimension)
+        rate = torch.zeros_like(w)
+        for group, jet in zip(disc.groups, jets, strict=True):
+            for e in range(group.order):
+                scale = (h[..., None] ** e * group.factors[:, e])[..., None]
+                w[..., group.columns[:, e]] = (jet[..., e, :] / scale).mT
+                rate[..., group.columns[:, e]] = (jet[..., e + 1, :] / (h[..., None, None] * scale)).mT
+        return self.times[:-1][which].unsqueeze(-1) + h.unsqueeze(-1) * (z + 1.0), w, rate
 
     def on_segment(self, z: Tensor, segment: int) -> tuple[Tensor, Tensor, Tensor]:
         """(t (m,), w (m, 2n), ẇ (m, 2n)) at z ∈ [−1, 1] of one segment; chained entries of ẇ are exact derivatives."""
-        h = (self.times[segment + 1] - self.times[segment]) / 2
-        w = self.xi.new_zeros(len(z), self.collocation.bvp.dimension)
-        rate = torch.zeros_like(w)
-        for group, jet in zip(self.collocation.discretisation.groups, self._jets(z, segment), strict=True):
-            for e in range(group.order):
-                scale = (h**e * group.factors[:, e])[:, None]
-                w[:, group.columns[:, e]] = (jet[:, e] / scale).mT
-                rate[:, group.columns[:, e]] = (jet[:, e + 1] / (h * scale)).mT
-        return self.times[segment] + h * (z + 1.0), w, rate
+        return self._at(z, segment)
+
+    def on_segments(self, z: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """As ``on_segment`` at the same z (m,) of every segment, one after the other (K·m, ·); and each one's index."""
+        t, w, rate = self._at(z, slice(None))
+        index = torch.arange(len(t), device=t.device).repeat_interleave(len(z))
+        return t.flatten(), w.flatten(0, 1), rate.flatten(0, 1), index
 
     def __call__(self, t: Tensor) -> Tensor:
         """w (m, 2n) at scaled times (m,)."""
@@ -86,9 +93,7 @@ class Curve:
         """ẇ − F at scaled times off the nodes: (t (K·n,), (K·n, 2n)), on an even grid inside every segment."""
         step = 2.0 / n_points
         z = torch.linspace(-1 + step / 2, 1 - step / 2, n_points, dtype=self.xi.dtype, device=self.xi.device)
-        parts = [self.on_segment(z, k) for k in range(self.collocation.n_segments)]
-        t, w, rate = (torch.cat(items) for items in zip(*parts, strict=True))
-        segment = torch.arange(len(parts), device=self.xi.device).repeat_interleave(n_points)
+        t, w, rate, segment = self.on_segments(z)
         return t, rate - self.collocation.bvp.rates(t[:, None], w, self.setting(segment))
 
     def off_node_residuals(self, n_points: int = 50) -> Tensor:

@@ -19,7 +19,7 @@ from ponn_torch.ansatz.networks import MLP
 from ponn_torch.numerics.nodes import NodeSet, legendre_moments
 from ponn_torch.optimal_control.deep_expressions import DeepExpressions
 from ponn_torch.optimal_control.expressions import Expressions, LinearExpressions
-from ponn_torch.optimal_control.pontryagin import BoundaryValueProblem, Chain, probe_points, probe_settings
+from ponn_torch.optimal_control.pontryagin import BoundaryValueProblem, Chain
 
 # -- test functions: how the pointwise residual becomes rows ---------------------------------------------------------
 
@@ -153,16 +153,6 @@ class Discretisation:
         none = torch.zeros(0, dtype=torch.long, device=self.nodes.points.device)
         return torch.cat([none, *(g.columns[:, -1] for g in self.groups if not g.trivial)])
 
-    @cached_property
-    def couplings(self) -> Tensor:
-        """Boolean (2n, 2n): F_i depends on w_j, found at random points."""
-        bvp, found = self.bvp, []
-        t, w = probe_points(bvp, 16, seed=1)
-        for setting in probe_settings(bvp, t):
-            by_w = bvp.linearised_rates(t, w, setting, range(bvp.dimension))[2]
-            found.append((by_w != 0).any(0))  # NaN counts: nothing says that it does not depend
-        return torch.stack(found).any(0)
-
     def active_orders(self, group: Group, other: Group) -> list[int]:
         """Derivatives e of the other group's chains that this group's equations depend on."""
         return self._active_orders[self.groups.index(group), self.groups.index(other)]
@@ -172,6 +162,6 @@ class Discretisation:
         out = {}
         for i, group in enumerate(self.groups):
             for j, other in enumerate(self.groups):
-                depends = self.couplings[group.columns[:, -1]][:, other.columns].any(0).any(0).tolist()
+                depends = self.bvp.couplings[group.columns[:, -1]][:, other.columns].any(0).any(0).tolist()
                 out[i, j] = [] if group.trivial else [e for e in range(other.order) if depends[e]]
         return out

@@ -110,8 +110,10 @@ class LinearExpressions:
     def jets_at(self, z: Tensor, weights: Tensor, kappas: Sequence[Tensor]) -> list[Tensor]:
         out = []
         for i, (group, kappa) in enumerate(zip(self.groups, kappas, strict=True)):
-            free, known = self.tables[i].expression.tables(z, group.order)
-            table, both = torch.cat([_free(group, free), known], -1), torch.cat([self.beta(i, weights), kappa], -1)
+            table, both = group.switching(z, group.order)[:, :, 0], kappa
+            if not group.trivial:  # a trivial chain is its Hermite interpolant
+                free, _ = self.tables[i].expression.tables(z, group.order)
+                table, both = torch.cat([free, table], -1), torch.cat([self.beta(i, weights), kappa], -1)
             out.append(torch.einsum("omk,...dk->...dom", table, both))
         return out
 

@@ -34,17 +34,9 @@ def linearise(collocation: Collocation, xi: Tensor) -> tuple[Tensor, ArrowJacobi
     local = disc.expressions.pull_back(unknowns.weights, slopes)
     shared = local.new_zeros(*local.shape[:-1], 2 * disc.bvp.dimension + 2)
     _by_knots(disc, slopes, factors, shared)
-    by_h = _by_half_length(collocation, jets, kappas, h, rates, by_t, by_w)
-    f, g = (fraction[:, None, None] for fraction in collocation.end_fractions)
-    for group, stretch in zip(disc.groups, by_h, strict=True):
-        # h = (t₁ − t₀)/2 and t = t₀ + h (z + 1): what depends on t apart from h moves with t₀
-        drift = torch.zeros_like(stretch)
-        if not group.trivial:
-            scale = h[..., None] ** group.order * group.factors[:, -1]
-            drift = -scale[..., None] * by_t[..., group.active].mT
-        by_start, by_end = drift - 0.5 * stretch, 0.5 * stretch
-        anchors = torch.stack([(1 - f) * by_start + (1 - g) * by_end, f * by_start + g * by_end], -1)
-        shared[..., group.rows, -2:] = (group.test @ anchors).flatten(-3, -2)
+    if len(collocation.free_times):
+        by_h = _by_half_length(collocation, jets, kappas, h, rates, by_t, by_w)
+        _by_times(collocation, by_h, h, by_t, shared)
 
     extra_rows, extra = collocation.extra_linearised(unknowns)
     residual = torch.cat([collocation.equations(jets, h, rates).flatten(-2), extra_rows], -1)
@@ -89,6 +81,19 @@ def _by_half_length(
             top = top - scale[..., None] * (growth + total[..., group.active].mT)
         out.append(top)
     return out
+
+
+def _by_times(collocation: Collocation, by_h: Sequence[Tensor], h: Tensor, by_t: Tensor, shared: Tensor) -> None:
+    """Fill the columns of the anchors: h = (t₁ − t₀)/2, and t = t₀ + h (z + 1) moves with t₀ apart from h."""
+    f, g = (fraction[:, None, None] for fraction in collocation.end_fractions)
+    for group, stretch in zip(collocation.discretisation.groups, by_h, strict=True):
+        drift = torch.zeros_like(stretch)
+        if not group.trivial:
+            scale = h[..., None] ** group.order * group.factors[:, -1]
+            drift = -scale[..., None] * by_t[..., group.active].mT
+        by_start, by_end = drift - 0.5 * stretch, 0.5 * stretch
+        anchors = torch.stack([(1 - f) * by_start + (1 - g) * by_end, f * by_start + g * by_end], -1)
+        shared[..., group.rows, -2:] = (group.test @ anchors).flatten(-3, -2)
 
 
 def _cotangents(disc: Discretisation, h: Tensor, by_w: Tensor) -> Cotangents:

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Any
 
 import torch
@@ -160,6 +161,14 @@ class BoundaryValueProblem:
         varied = (setting.regime.smoothing, setting.regime.arcs, *setting.parameters.values())
         value, (by_t, by_w) = pointwise_jacobian(rates, rows, t, w, constants=varied)
         return value, by_t[..., 0], by_w
+
+    @cached_property
+    def couplings(self) -> Tensor:
+        """Boolean (2n, 2n): F_i depends on w_j, found at random points."""
+        t, w = probe_points(self, 16, seed=1)
+        rows = range(self.dimension)
+        slopes = [self.linearised_rates(t, w, setting, rows)[2] for setting in probe_settings(self, t)]
+        return (torch.stack(slopes) != 0).any(0).any(0)  # NaN counts: nothing says that it does not depend
 
     def switching(self, t: Tensor, w: Tensor, setting: Setting) -> Tensor:
         """Switching functions (..., m), positive where more control is better."""

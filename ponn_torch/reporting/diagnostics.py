@@ -54,10 +54,7 @@ def hamiltonian_figure(solution: Solution) -> Figure:
 def _at_nodes(curve: Curve) -> tuple[Tensor, Tensor]:
     """(scaled t (K·n,), |ẇ − F| (K·n, 2n)) at the collocation nodes."""
     collocation = curve.collocation
-    z = collocation.discretisation.nodes.points
-    parts = [curve.on_segment(z, k) for k in range(collocation.n_segments)]
-    t, w, rate = (torch.cat(items) for items in zip(*parts, strict=True))
-    segment = torch.arange(len(parts), device=t.device).repeat_interleave(len(z))
+    t, w, rate, segment = curve.on_segments(collocation.discretisation.nodes.points)
     return t, (rate - collocation.bvp.rates(t[:, None], w, curve.setting(segment))).abs()
 
 

@@ -309,7 +309,7 @@ class _Run:
         if not isinstance(solution.curve.collocation.discretisation.form, Strong):
             return True
         curve, points = solution.curve, solution.curve.collocation.discretisation.nodes.points
-        largest = max(float(curve.on_segment(points, k)[2].abs().max()) for k in range(curve.collocation.n_segments))
+        largest = float(curve.on_segments(points)[2].abs().max())
         return solution.off_node_residual <= self.solver.trust * largest
 
     # -- refinement ---------------------------------------------------------------------------------------------------

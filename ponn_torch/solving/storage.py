@@ -151,10 +151,9 @@ def _make_basis(saved: dict[str, Any], buffers: dict[str, Tensor], dtype: torch.
 
 def _fingerprint(curve: Curve) -> dict[str, Tensor]:
     """What tells one curve of one problem from another: values and rates at some points, boundary data."""
-    bvp, n_segments = curve.collocation.bvp, curve.collocation.n_segments
+    bvp = curve.collocation.bvp
     z = torch.linspace(-0.9, 0.8, 5, dtype=curve.xi.dtype, device=curve.xi.device)
-    t, w, _ = (torch.cat(parts) for parts in zip(*(curve.on_segment(z, k) for k in range(n_segments)), strict=True))
-    segment = torch.arange(n_segments, device=z.device).repeat_interleave(len(z))
+    t, w, _, segment = curve.on_segments(z)
     states, costates = bvp.to_physical(w)
     time = curve.times[-1:] if bvp.problem.free_final_time else curve.times.new_tensor([bvp.final_time])
     return {

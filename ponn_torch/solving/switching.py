@@ -38,8 +38,7 @@ def switching_along(curve: Curve, t: Tensor, w: Tensor | None = None) -> Tensor:
 def grid(curve: Curve, n_points: int = 400) -> tuple[Tensor, Tensor]:
     """Scaled times and w on an even grid with both ends in every segment, (K·n,) and (K·n, 2n)."""
     z = torch.linspace(-1.0, 1.0, n_points, dtype=curve.xi.dtype, device=curve.xi.device)
-    parts = [curve.on_segment(z, k)[:2] for k in range(curve.collocation.n_segments)]
-    return torch.cat([t for t, _ in parts]), torch.cat([w for _, w in parts])
+    return curve.on_segments(z)[:2]
 
 
 def find_structure(curve: Curve, n_points: int = 1000, polish: int = 4) -> Structure:
