@@ -75,15 +75,15 @@ class _OrthogonalPolynomials(LinearBasis):
         """(a_k, c_k)."""
 
     def features(self, z: Tensor, order: int) -> Tensor:
-        counts = torch.arange(1, order + 1, dtype=z.dtype, device=z.device)[:, None]
+        # Leibniz: (z p)^(e) = z p^(e) + e p^(e-1)
+        lower = torch.diag(torch.arange(1, order + 1, dtype=z.dtype, device=z.device), -1)
         previous = z.new_zeros(order + 1, z.shape[0])
         current = torch.cat([torch.ones_like(previous[:1]), previous[1:]])
         polynomials = [current]
         for degree in range(self.lowest_degree + self.size - 1):
             a, c = self.recurrence(degree)
-            # Leibniz: (z p)^(e) = z p^(e) + e p^(e-1)
-            product = z * current + torch.cat([previous.new_zeros(1, z.shape[0]), counts * current[:-1]])
-            previous, current = current, a * product - c * previous
+            rest = torch.addmm(previous, lower, current, beta=-c, alpha=a)
+            previous, current = current, torch.addcmul(rest, z, current, value=a)
             polynomials.append(current)
         return torch.stack(polynomials[self.lowest_degree :], dim=-1)
 
