@@ -280,8 +280,8 @@ def test_ends_and_knots_are_met_by_random_weights(name, mass_variable, n_segment
     parts = [curve.on_segment(ends, k) for k in range(n_segments)]
     for known, reached in ((bvp.known_initial, parts[0][1][0]), (bvp.known_final, parts[-1][1][1])):
         given = ~torch.isnan(known)
-        assert given.any()
-        assert float((reached - known)[given].abs().max()) < 1e-12 * size
+        assert given.any() or bvp.n_terminal_rows  # an end of which rows alone speak
+        assert bool(((reached - known)[given].abs() < 1e-12 * size).all())
     for k in range(n_segments):  # every knot from both sides, value and, along chains, derivatives
         torch.testing.assert_close(parts[k][0], curve.times[[k, k + 1]], rtol=1e-14, atol=1e-14)
         assert float((parts[k][1] - curve.knots[[k, k + 1]]).abs().max()) < 1e-12 * size
