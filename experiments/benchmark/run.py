@@ -13,6 +13,7 @@ from typing import Any
 import torch
 from torch.func import jacfwd, jacrev
 
+from experiments.benchmark.methods import methods
 from experiments.solves import PROBLEMS, row
 from experiments.tables import Report, markdown, share, spread, write
 from ponn_torch.ansatz.basis import Chebyshev
@@ -136,19 +137,26 @@ def solves(n_seeds: int) -> Report:
     return Report({"solves": rows}, text)
 
 
+PARTS: dict[str, tuple[Callable[[int], Report], str]] = {
+    "linearisation": (linearisation, "repeats"),
+    "solves": (solves, "seeds"),
+    "methods": (methods, "seeds"),
+}
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--repeats", type=int, default=15, help="calls of each routine (default 15)")
     parser.add_argument("--seeds", type=int, default=10, help="seeds 0 … SEEDS − 1 of the solves (default 10)")
+    parser.add_argument("--parts", nargs="+", choices=PARTS, default=list(PARTS))
     arguments = parser.parse_args()
     for name in ("repeats", "seeds"):
         if getattr(arguments, name) < 1:
             parser.error(f"--{name} {getattr(arguments, name)}; allowed: at least 1")
     torch.set_num_threads(1)
-    for name, report in (
-        ("linearisation", linearisation(arguments.repeats)),
-        ("solves", solves(arguments.seeds)),
-    ):
+    for name in arguments.parts:
+        run, counted = PARTS[name]
+        report = run(getattr(arguments, counted))
         print(f"\n{report.summary}\n", flush=True)
         write(FOLDER, name, report)
 
