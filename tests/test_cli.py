@@ -242,11 +242,12 @@ def test_sweep_counts_and_explains_members_that_fail(capsys: pytest.CaptureFixtu
     printed = capsys.readouterr().out
     assert "2 of 3 certified, 1 failed" in printed
     assert "problem.initial_mass = -1" in printed.splitlines()[-4]
-    outcomes = [outcome_in(folder / str(i)) for i in range(3)]
+    folders = [folder / f"{i}_problem.initial_mass={mass}" for i, mass in enumerate((1905, -1, 1900))]
+    outcomes = [outcome_in(member) for member in folders]
     assert [outcome["exit_code"] for outcome in outcomes] == [0, 1, 0]
     assert outcomes[0]["known_cost"] == pytest.approx(268.0146563274)
     assert outcomes[2]["known_cost"] is None
-    assert "problem.initial_mass = -1" in (folder / "1" / "failure.txt").read_text(encoding="utf-8")
+    assert "problem.initial_mass = -1" in (folders[1] / "failure.txt").read_text(encoding="utf-8")
 
 
 @pytest.mark.slow
@@ -256,8 +257,10 @@ def test_sweep_in_parallel_runs_every_member(capsys: pytest.CaptureFixture[str],
     members = ["seed=range(2)", "problem.initial_mass=1905,-1"]
     assert main(["-m", *LANDING, *members, *parallel, f"hydra.sweep.dir='{folder}'"]) == 1
     assert "2 of 4 certified, 2 failed" in capsys.readouterr().out
-    for i in range(4):
-        environment = json.loads((folder / str(i) / "environment.json").read_text(encoding="utf-8"))
+    found = list(folder.glob("*/environment.json"))
+    assert len(found) == 4
+    for path in found:
+        environment = json.loads(path.read_text(encoding="utf-8"))
         assert environment["torch_threads"] == 1
 
 

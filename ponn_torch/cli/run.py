@@ -6,7 +6,7 @@ import json
 import math
 import shutil
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -16,7 +16,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from ponn_torch.build import Plan, build, resolved
 from ponn_torch.optimal_control.problem import DisplayUnit
-from ponn_torch.reporting.members import OUTCOME, SOLUTION
+from ponn_torch.reporting.members import BESIDES, OUTCOME, SOLUTION
 from ponn_torch.reporting.recorder import Recorder, finite_or_none
 from ponn_torch.reporting.records import RECORDS, RunRecorder
 from ponn_torch.reporting.reference import Reference
@@ -86,10 +86,16 @@ class _Keeper(Recorder):
         return self.final or (kept[-1] if kept else None)
 
 
-def run(config: DictConfig, folder: Path, overrides: Sequence[str], plan: Plan | None = None) -> Outcome:
+def run(
+    config: DictConfig,
+    folder: Path,
+    overrides: Sequence[str],
+    plan: Plan | None = None,
+    choices: Mapping[str, Any] | None = None,
+) -> Outcome:
     """Solve what the config asks for and leave a complete folder; raises for nothing that happens in between.
 
-    ``plan`` is used if it was built from the same config.
+    ``plan`` is used if it was built from the same config. ``choices`` name the config of each group.
     """
     folder.mkdir(parents=True, exist_ok=True)
     _clear(folder)
@@ -100,7 +106,7 @@ def run(config: DictConfig, folder: Path, overrides: Sequence[str], plan: Plan |
         if plan is None or resolved(config) != plan.settings:
             plan = build(config)
         _write_text(folder / CONFIG, OmegaConf.to_yaml(OmegaConf.create(plan.settings)))
-        outcome = _solve(plan, folder, keeper)
+        outcome = _solve(plan, folder, keeper, _told_apart(plan, overrides, choices or {}))
     except ConfigError as wrong:
         outcome = Outcome(BAD_INPUT, str(wrong))
     except KeyboardInterrupt:
@@ -123,12 +129,21 @@ def run(config: DictConfig, folder: Path, overrides: Sequence[str], plan: Plan |
     return outcome
 
 
-def _solve(plan: Plan, folder: Path, keeper: _Keeper) -> Outcome:
+def _told_apart(plan: Plan, overrides: Sequence[str], choices: Mapping[str, Any]) -> dict[str, Any]:
+    """The few settings that tell runs apart: what was chosen and what was changed, for TensorBoard's HPARAMS."""
+    given = (text.partition("=") for text in overrides)
+    changed = {key.lstrip("+~"): value.strip("'\"") for key, _, value in given}
+    chosen = {group: choices[group] for group in ("ansatz", "optimizer") if group in choices}
+    told = chosen | {"problem": plan.problem.name, "seed": plan.seed}
+    return told | {key: value for key, value in changed.items() if key.split(".")[0] not in (*told, *BESIDES)}
+
+
+def _solve(plan: Plan, folder: Path, keeper: _Keeper, told: Mapping[str, Any]) -> Outcome:
     recording = plan.recording
     torch.set_num_threads(plan.threads)
     recorder = RunRecorder(
         folder,
-        settings=plan.settings,
+        settings=told,
         cost_name=plan.problem.cost_name,
         tensorboard=recording.tensorboard,
         progress=recording.progress,

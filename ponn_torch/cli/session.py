@@ -8,7 +8,7 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
@@ -16,12 +16,13 @@ from typing import Any
 
 import hydra
 from hydra.core.hydra_config import HydraConfig
+from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import DictConfig, OmegaConf
 
 from ponn_torch.build import Plan, build
 from ponn_torch.cli.overrides import CONFIG, Command, InputError, composed, config_folder
 from ponn_torch.cli.run import Outcome, run
-from ponn_torch.reporting.members import OUTCOME
+from ponn_torch.reporting.members import OUTCOME, natural
 from ponn_torch.settings import ConfigError
 
 BUG, BAD_INPUT, INTERRUPTED = 3, 1, 130
@@ -57,7 +58,7 @@ def execute(command: Command) -> int:
 
 def _member(config: DictConfig, plan: Plan | None = None) -> Outcome:
     about = HydraConfig.get()
-    return run(config, Path(about.runtime.output_dir), list(about.overrides.task), plan)
+    return run(config, Path(about.runtime.output_dir), list(about.overrides.task), plan, about.runtime.choices)
 
 
 def _under_hydra(task: Any, options: list[str], overrides: list[str]) -> None:
@@ -112,6 +113,8 @@ def _sweep(command: Command) -> int:
     about = composed([text for text in command.overrides if _plain(text)], with_hydra=True)
     folder = Path(str(OmegaConf.select(about, "hydra.sweep.dir")))
     overrides = [text for text in command.overrides if not text.startswith("hydra.sweep.dir=")]
+    if not any(text.startswith("hydra.sweep.subdir=") for text in overrides):
+        overrides += _named_by_what_varies(command.overrides)
     name = str(folder).replace("\\", "\\\\").replace("'", "\\'")
     began, interrupted = time.time(), False
     try:
@@ -121,10 +124,23 @@ def _sweep(command: Command) -> int:
         interrupted = True
     found = [path for path in folder.rglob(OUTCOME) if path.stat().st_mtime >= began - 1]
     members = [(path.parent, json.loads(path.read_text(encoding="utf-8"))) for path in found]
-    members.sort(key=lambda member: (len(member[0].name), member[0].name))
+    members.sort(key=lambda member: natural(str(member[0])))
     print(_summary(folder, members))
     codes = [int(outcome["exit_code"]) for _, outcome in members]
     return INTERRUPTED if interrupted else max(codes, default=BUG)
+
+
+def _named_by_what_varies(overrides: Sequence[str]) -> list[str]:
+    """Overrides that call a member's folder by its number and the values it has of what is swept."""
+    parsed = OverridesParser.create().parse_overrides(list(overrides))
+    fixed = [override.key_or_group for override in parsed if not override.is_sweep_override()]
+    if len(fixed) == len(parsed):
+        return []
+    quoted = ", ".join(f"'{key}'" for key in fixed)
+    return [
+        f"hydra.job.config.override_dirname.exclude_keys=[{quoted}]",
+        "hydra.sweep.subdir='${hydra.job.num}_${hydra.job.override_dirname}'",
+    ]
 
 
 def _plain(text: str) -> bool:

@@ -21,9 +21,17 @@ from ponn_torch.solving.certificate import Certificate
 from ponn_torch.solving.observer import Look, StageResult
 from ponn_torch.solving.solution import Solution
 
-# Written at every iteration; NaN where an optimiser has no such thing, so that runs share their charts.
+# Written at every iteration by every optimiser, so that runs share their charts.
 OPTIM_TAGS = ("damping", "step", "accepted", "running", "residuals", "linearisations")
-METRICS = ("certificate/certified", "certificate/end_error_scaled", "certificate/cost", "time/seconds")
+# of a certificate, what a person compares; all of it stands in certificate.json
+JUDGED = ("certified", "cost", "cost_error", "end_error_scaled", "control_end_error_scaled") + (
+    "hamiltonian_drift", "off_node_residual", "sign_violation", "transversality"
+)  # fmt: skip
+METRICS = (
+    *(f"certificate/{name}" for name in ("certified", "cost", "end_error_scaled", "off_node_residual")),
+    "residual/total",
+    "time/cpu_seconds",
+)
 ERRORS = ("states", "costates")  # against a reference, where there is one
 MAX_FIGURES = 30  # TensorBoard crawls under hundreds
 
@@ -40,20 +48,17 @@ def flatten(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
 
 
 def _hyperparameters(settings: Mapping[str, Any]) -> dict[str, float | int | str]:
-    """Numbers as they are, everything else as text: what the HPARAMS tab can hold."""
-    return {
-        name: value if isinstance(value, int | float) and not isinstance(value, bool) else str(value)
-        for name, value in flatten(settings).items()
-        if value is not None
-    }
+    """Numbers as they are, text that reads as one as a number, everything else as text: what HPARAMS can hold."""
+    return {name: _number_or_text(value) for name, value in flatten(settings).items() if value is not None}
 
 
-def _numbers(values: Mapping[str, Any]) -> dict[str, float]:
-    return {
-        name.replace(".", "/"): float(value)
-        for name, value in flatten(values).items()
-        if isinstance(value, bool | int | float)
-    }
+def _number_or_text(value: Any) -> float | int | str:
+    if isinstance(value, int | float) and not isinstance(value, bool):
+        return value
+    try:
+        return float(value)
+    except (TypeError, ValueError):
+        return str(value)
 
 
 class TensorBoard(Recorder):
@@ -67,7 +72,8 @@ class TensorBoard(Recorder):
         self, folder: Path, *, settings: Mapping[str, Any], cost_name: str = "cost", figures: bool = True
     ) -> None:
         self._writer = SummaryWriter(str(folder), flush_secs=10)
-        self._step, self._stage, self._start = 0, -1, time.perf_counter()
+        self._step, self._stage = 0, -1
+        self._start, self._cpu_start = time.perf_counter(), time.process_time()
         self._cost_tag, self._failed = f"cost/{cost_name}", False
         self._figures: deque[tuple[int, Solution]] = deque(maxlen=MAX_FIGURES if figures else 0)
         experiment, begin, self._end = hparams(_hyperparameters(settings), dict.fromkeys(METRICS, 0.0))
@@ -81,9 +87,9 @@ class TensorBoard(Recorder):
         entries = [Summary.Value(tag=tag, simple_value=value) for tag, value in values.items()]
         self._add(Summary(value=entries), step)
 
-    @property
-    def _seconds(self) -> float:
-        return time.perf_counter() - self._start
+    def _times(self) -> dict[str, float]:
+        now, cpu = time.perf_counter(), time.process_time()
+        return {"time/seconds": now - self._start, "time/cpu_seconds": cpu - self._cpu_start}
 
     def stage_started(self, name: str, smoothing: float | None, index: int) -> None:
         self._stage = index
@@ -91,14 +97,17 @@ class TensorBoard(Recorder):
 
     def iteration(self, record: Record, look: Look) -> None:
         self._step = int(record.get("global_step", self._step + 1))
-        values = {"residual/total": float(record["norm"])}
+        norm = float(record["norm"])
+        values = {"residual/total": norm}
+        if norm > 0:  # charts are linear until somebody clicks
+            values["residual/log10_total"] = math.log10(norm)
         values |= {f"residual/{name}": float(norm) for name, norm in look.blocks().items()}
-        values |= {f"optim/{name}": float(record.get(name, math.nan)) for name in OPTIM_TAGS}
+        values |= {f"optim/{name}": float(record[name]) for name in OPTIM_TAGS}
         values["stage/index"] = float(self._stage)
         smoothing = record.get("smoothing")
         if smoothing is not None:
             values["stage/smoothing"] = float(smoothing)
-        values["time/seconds"] = self._seconds
+        values |= self._times()
         value = look.cost()
         if math.isfinite(value):
             values[self._cost_tag] = value
@@ -120,8 +129,9 @@ class TensorBoard(Recorder):
         self._writer.flush()
 
     def certificate(self, certificate: Certificate) -> None:
-        values = {f"certificate/{name}": value for name, value in _numbers(certificate.to_dict()).items()}
-        self._scalars(values | {"time/seconds": self._seconds}, self._step)
+        judged = ((name, getattr(certificate, name)) for name in JUDGED)
+        values = {f"certificate/{name}": float(value) for name, value in judged if value is not None}
+        self._scalars(values | self._times(), self._step)
         self._writer.add_text("certificate", f"```\n{certificate.to_text()}\n```", self._step)
         self._writer.flush()
 

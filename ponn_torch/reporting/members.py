@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -94,14 +95,15 @@ def read_members(folder: Path) -> list[Member]:
     Raises:
         FileNotFoundError: none is there.
     """
-    found = sorted(folder.rglob(OUTCOME), key=lambda path: [_natural(part) for part in path.parent.parts])
+    found = sorted(folder.rglob(OUTCOME), key=lambda path: natural(str(path.parent)))
     if not found:
         raise FileNotFoundError(f"no run under {str(folder)!r}: no {OUTCOME} in it")
     return [_read(path.parent) for path in found]
 
 
-def _natural(name: str) -> tuple[int, str]:
-    return (int(name), "") if name.isdigit() else (10**9, name)
+def natural(name: str) -> list[tuple[int, str]]:
+    """A key to sort by in which 10 comes after 9."""
+    return [(int(part), "") if part.isdigit() else (-1, part) for part in re.split(r"(\d+)", name)]
 
 
 def _read(folder: Path) -> Member:

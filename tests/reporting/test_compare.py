@@ -33,7 +33,10 @@ def sweep(tmp_path_factory):
 
 def test_members_hold_what_their_runs_left(sweep):
     members = read_members(sweep[0])
-    assert [member.folder.name for member in members] == ["0", "1", "2", "3", "bad"]
+    names = [
+        f"{i}_ansatz.size={size},seed={seed}" for i, (size, seed) in enumerate([(12, 0), (12, 1), (16, 0), (16, 1)])
+    ]
+    assert [member.folder.name for member in members] == [*names, "bad"]
     member = members[0]
     assert (member.settings["ansatz.size"], member.seed) == ("12", "0")
     assert len(member.iterations) == member.total("n_iterations")
