@@ -24,9 +24,17 @@ from ponn_torch.solving.solution import Solution
 # Written at every iteration by every optimiser, so that runs share their charts.
 OPTIM_TAGS = ("damping", "step", "accepted", "running", "residuals", "linearisations")
 # of a certificate, what a person compares; all of it stands in certificate.json
-JUDGED = ("certified", "cost", "cost_error", "end_error_scaled", "control_end_error_scaled") + (
-    "hamiltonian_drift", "off_node_residual", "sign_violation", "transversality"
-)  # fmt: skip
+JUDGED = (
+    "certified",
+    "cost",
+    "cost_error",
+    "end_error_scaled",
+    "control_end_error_scaled",
+    "hamiltonian_drift",
+    "off_node_residual",
+    "sign_violation",
+    "transversality",
+)
 METRICS = (
     *(f"certificate/{name}" for name in ("certified", "cost", "end_error_scaled", "off_node_residual")),
     "residual/total",
@@ -56,8 +64,8 @@ def _number_or_text(value: Any) -> float | int | str:
     if isinstance(value, int | float) and not isinstance(value, bool):
         return value
     try:
-        return float(value)
-    except (TypeError, ValueError):
+        return float(value) if isinstance(value, str) else str(value)
+    except ValueError:
         return str(value)
 
 
@@ -102,7 +110,7 @@ class TensorBoard(Recorder):
         if norm > 0:  # charts are linear until somebody clicks
             values["residual/log10_total"] = math.log10(norm)
         values |= {f"residual/{name}": float(norm) for name, norm in look.blocks().items()}
-        values |= {f"optim/{name}": float(record[name]) for name in OPTIM_TAGS}
+        values |= {f"optim/{name}": float(record[name]) for name in OPTIM_TAGS if name in record}
         values["stage/index"] = float(self._stage)
         smoothing = record.get("smoothing")
         if smoothing is not None:

@@ -171,7 +171,8 @@ def time_axes(
     axes[0].set_xlim(0.0, end)
     axes[-1].set_xlabel(axis_label("t", unit(solution.problem, "time")))
     if not measured:
-        figure.subplots_adjust(left=0.14, right=0.98, top=0.93, bottom=0.14, hspace=0.15)
+        tall = figure.get_figheight()  # room for labels below and for a legend on the right
+        figure.subplots_adjust(left=0.14, right=0.88, top=1 - 0.24 / tall, bottom=0.48 / tall, hspace=0.15)
     figure.align_ylabels(axes)
     return figure, axes
 

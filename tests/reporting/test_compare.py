@@ -5,6 +5,8 @@ import json
 import math
 
 import pytest
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+from tensorboard.plugins.hparams import plugin_data_pb2
 
 from ponn_torch.cli import main as ponn
 from ponn_torch.cli.compare import main
@@ -95,6 +97,20 @@ def test_the_command_writes_tables_and_figures(sweep, tmp_path, capsys):
     assert [row["seed"] for row in rows] == ["0", "1", "0", "1", "0"]
     assert float(rows[2]["error of states"]) < 1e-9
     assert math.isnan(float(rows[4]["CPU s"])) or float(rows[4]["CPU s"]) == 0
+
+
+def test_hyperparameters_are_the_settings_that_tell_members_apart(tmp_path):
+    chosen = [*SMALL, "record.tensorboard=true", "ansatz=legendre", "ansatz.size=10", "seed=3", "n_starts=2"]
+    ponn([*chosen, f"hydra.run.dir='{tmp_path}'"])
+    accumulator = EventAccumulator(str(tmp_path))
+    accumulator.Reload()
+    started = accumulator.PluginTagToContent("hparams")["_hparams_/session_start_info"]
+    values = plugin_data_pb2.HParamsPluginData.FromString(started).session_start_info.hparams
+    told = {name: value.string_value or value.number_value for name, value in values.items()}
+    assert told == {
+        "ansatz": "legendre", "optimizer": "lm", "problem": "mars_landing", "seed": 3.0, "ansatz.size": 10.0,
+        "continuation": "single", "refinement": "none", "n_starts": 2.0, "nodes.n_nodes": 30.0,
+    }  # fmt: skip
 
 
 def test_nothing_to_compare_is_said_in_a_line(tmp_path, capsys):

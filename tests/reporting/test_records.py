@@ -59,6 +59,7 @@ def test_tags_do_not_depend_on_the_optimiser(runs):
     assert {
         "residual/total", "residual/v_1", "residual/m", "residual/lambda_m", "optim/damping", "optim/step",
         "optim/accepted", "stage/smoothing", "cost/fuel", "certificate/certified", "time/seconds",
+        "time/cpu_seconds", "residual/log10_total",
     } <= set(tags["lm"]["scalars"])  # fmt: skip
 
 
