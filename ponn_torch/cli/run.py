@@ -135,11 +135,7 @@ def _told_apart(plan: Plan, overrides: Sequence[str], choices: Mapping[str, Any]
     changed = {key.lstrip("+~"): value.strip("'\"") for key, _, value in given}
     chosen = {group: choices[group] for group in ("ansatz", "optimizer") if group in choices}
     told = chosen | {"problem": plan.problem.name, "seed": plan.seed}
-    return told | {
-        key: value
-        for key, value in changed.items()
-        if key not in told and key.split(".")[0] not in (*BESIDES, "problem")
-    }
+    return told | {key: value for key, value in changed.items() if key not in told and key.split(".")[0] not in BESIDES}
 
 
 def _solve(plan: Plan, folder: Path, keeper: _Keeper, told: Mapping[str, Any]) -> Outcome:
