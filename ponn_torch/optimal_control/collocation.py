@@ -221,6 +221,21 @@ class Collocation:
         t = times[..., :-1, None] + h[..., None] * (self.discretisation.nodes.points + 1.0)
         return t.unsqueeze(-1), self.assemble(pieces)
 
+    def along(self, unknowns: Unknowns, t: Tensor, segment: Tensor) -> Tensor:
+        """w (..., m, 2n) at scaled times (..., m), each on a given segment (..., m)."""
+        batch, k = t.shape[:-1], self.n_segments
+        h = (unknowns.times[..., 1:] - unknowns.times[..., :-1]) / 2
+        kappas = [kappa.flatten(0, -3) for kappa in self.kappas(unknowns, h)[0]]
+        start, half = unknowns.times[..., :-1].gather(-1, segment), h.gather(-1, segment)
+        member = torch.arange(batch.numel(), device=t.device).view(*batch, 1)
+        which, half = (segment + k * member).flatten(), half.flatten()
+        z = (t.flatten() - start.flatten()) / half - 1.0
+        jets = self.discretisation.expressions.jets_along(z, which, unknowns.weights.flatten(0, -2), kappas)
+        pieces = []
+        for group, jet in zip(self.discretisation.groups, jets, strict=True):
+            pieces += [jet[:, e] / (half**e * group.factors[:, e, None]) for e in range(group.order)]
+        return self.assemble(pieces).view(*t.shape, -1)
+
     def point_setting(self, shape: Sequence[int]) -> Setting:
         """The setting spread over points of batch × segments × nodes shape, flattened."""
         regime = self.setting.regime

@@ -70,13 +70,11 @@ class Curve:
 
     def __call__(self, t: Tensor) -> Tensor:
         """w (m, 2n) at scaled times (m,)."""
-        index, out = self.segment_of(t), self.xi.new_zeros(len(t), self.collocation.bvp.dimension)
-        for k in range(self.collocation.n_segments):
-            here = index == k
-            if bool(here.any()):
-                start, end = self.times[k], self.times[k + 1]
-                out[here] = self.on_segment(2 * (t[here] - start) / (end - start) - 1, k)[1]
-        return out
+        return self.at(t, self.segment_of(t))
+
+    def at(self, t: Tensor, segment: Tensor) -> Tensor:
+        """w (m, 2n) at scaled times (m,), each on a given segment."""
+        return self.collocation.along(self.unknowns, t, segment)
 
     def setting(self, segment: Tensor) -> Setting:
         """The regime and parameters at points of the given segments (m,)."""

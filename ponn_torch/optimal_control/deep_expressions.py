@@ -56,6 +56,14 @@ class DeepExpressions:
     def jets_at(self, z: Tensor, weights: Tensor, kappas: Sequence[Tensor]) -> list[Tensor]:
         return self._jets(z, [g.switching(z, g.order)[:, :, 0] for g in self.groups], weights, kappas)
 
+    def jets_along(self, z: Tensor, segment: Tensor, weights: Tensor, kappas: Sequence[Tensor]) -> list[Tensor]:
+        out = [z.new_zeros(group.n_chains, group.order + 1, len(z)) for group in self.groups]
+        for k in segment.unique().tolist():
+            here = segment == k
+            for whole, part in zip(out, self.jets_at(z[here], weights[k], [kappa[k] for kappa in kappas]), strict=True):
+                whole[..., here] = part
+        return out
+
     def _jets(self, z: Tensor, omegas: Sequence[Tensor], weights: Tensor, kappas: Sequence[Tensor]) -> list[Tensor]:
         jet = self.network.jet(weights, torch.cat([z, self.ends]), self.order) if self.n_heads else weights
         out = []

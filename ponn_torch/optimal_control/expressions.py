@@ -46,6 +46,10 @@ class Expressions(Protocol):
         """Per group the derivatives (..., d, q+1, m) at z (m,) of a segment: weights (..., n_own), κ (..., d, 2q)."""
         ...
 
+    def jets_along(self, z: Tensor, segment: Tensor, weights: Tensor, kappas: Sequence[Tensor]) -> list[Tensor]:
+        """As ``jets_at`` for points z (m,) of one segment (m,) each: weights (K, n_own), κ (K, d, 2q)."""
+        ...
+
     def pull_back(self, weights: Tensor, cotangents: Cotangents) -> Tensor:
         """∂(rows of a segment)/∂(its weights), (..., K, n_rows, n_own), at fixed κ."""
         ...
@@ -109,13 +113,24 @@ class LinearExpressions:
 
     def jets_at(self, z: Tensor, weights: Tensor, kappas: Sequence[Tensor]) -> list[Tensor]:
         out = []
-        for i, (group, kappa) in enumerate(zip(self.groups, kappas, strict=True)):
-            table, both = group.switching(z, group.order)[:, :, 0], kappa
-            if not group.trivial:  # a trivial chain is its Hermite interpolant
-                free, _ = self.tables[i].expression.tables(z, group.order)
-                table, both = torch.cat([free, table], -1), torch.cat([self.beta(i, weights), kappa], -1)
+        for i, kappa in enumerate(kappas):
+            table, both = self._table_at(i, z), torch.cat([self.beta(i, weights), kappa], -1)
             out.append(torch.einsum("omk,...dk->...dom", table, both))
         return out
+
+    def jets_along(self, z: Tensor, segment: Tensor, weights: Tensor, kappas: Sequence[Tensor]) -> list[Tensor]:
+        out = []
+        for i, kappa in enumerate(kappas):
+            both = torch.cat([self.beta(i, weights), kappa], -1)[segment]
+            out.append(torch.einsum("omk,mdk->dom", self._table_at(i, z), both))
+        return out
+
+    def _table_at(self, i: int, z: Tensor) -> Tensor:
+        """[B | Ω] (q+1, m, L + 2q) at z (m,); a trivial chain is its Hermite interpolant."""
+        group = self.groups[i]
+        if group.trivial:
+            return group.switching(z, group.order)[:, :, 0]
+        return torch.cat(self.tables[i].expression.tables(z, group.order), -1)
 
     def pull_back(self, weights: Tensor, cotangents: Cotangents) -> Tensor:
         n_rows = self.groups[-1].rows.stop

@@ -176,12 +176,9 @@ class Solution:
 
     def at(self, t: Tensor, segment: Tensor) -> tuple[Tensor, Setting]:
         """Scaled w (m, 2n) and the setting at scaled times, each on a given segment."""
-        times, w = self.curve.times, t.new_zeros(len(t), self.bvp.dimension)
-        for k in segment.unique().tolist():
-            here = segment == k
-            z = 2 * (t[here] - times[k]) / (times[k + 1] - times[k]) - 1
-            w[here] = self.curve.on_segment(z.clamp(-1.0, 1.0), k)[1]
-        return w, self.curve.setting(segment)
+        times = self.curve.times
+        inside = torch.minimum(torch.maximum(t, times[segment]), times[segment + 1])
+        return self.curve.at(inside, segment), self.curve.setting(segment)
 
     def _samples(self, t: Tensor, segment: Tensor) -> Samples:
         bvp, problem = self.bvp, self.problem
