@@ -318,7 +318,10 @@ class ThrustBall(Bounded):
         vector = zero.expand(*one.shape[:-1], self.size)
         at = [h(**self._controls(vector, zero + k * high)) for k in (0.0, 0.5, 1.0)]
         size = (at[2] - at[0]).abs() + 1e-4 * sum(a.abs() for a in at)
-        curved = bool(((at[2] - 2 * at[1] + at[0]).abs() > 1e-9 * size).any())
+        bend = at[2] - 2 * at[1] + at[0]
+        curved = bool((bend.abs() > 1e-9 * size).any())
+        if bool((bend < -1e-9 * size).any()):
+            raise ValueError(f"{self.name}: the Hamiltonian is concave in its magnitude; allowed: affine or convex")
         slope = ((cost(**self._controls(vector, zero + high)) - cost(**self._controls(vector, zero))) / high).flatten()
         constant = float(slope.min()) > 0 and float(slope.max() - slope.min()) <= 1e-9 * float(slope.max())
         rate = self.cost_rate or (float(slope[0]) if constant else unit / float(high.max()))
@@ -333,12 +336,14 @@ class ThrustBall(Bounded):
         zero = torch.zeros_like(like)
         vector = zero.expand(*like.shape[:-1], self.size)
         primer, slope = slopes(vector, zero + low)
-        norm = torch.sqrt((primer * primer).sum(-1, keepdim=True))
+        square = (primer * primer).sum(-1, keepdim=True)
+        some = square > 0  # where the primer vanishes no direction is better than another, and none is taken
+        norm = torch.sqrt(torch.where(some, square, 1.0)) * some
         at_lower = self._scaled(norm - slope)
         at_upper = self._scaled(norm - slopes(vector, zero + high)[1]) if self.curved else at_lower
         fraction = _fraction(at_lower, at_upper, self.curved, self, regime)
         magnitude = low + (high - low) * fraction
-        control = self._controls(-magnitude * primer / norm, magnitude)
+        control = self._controls(-magnitude * primer / torch.where(some, norm, 1.0), magnitude)
         return Minimiser(control, self._switching(at_lower, at_upper), fraction)
 
 
@@ -376,6 +381,8 @@ class Box(Bounded):
             difference = gradient(zero + low + step) - base
             scale = max(scale, float(difference.abs().max()), 1e-12 * float(base.abs().max()))
             changes.append(float(difference[..., i].abs().max()))
+            if float(difference[..., i].min()) < -1e-9 * float(base.abs().max()):
+                raise ValueError(f"{self.name}: the Hamiltonian is concave in component {i}; allowed: affine or convex")
             difference[..., i] = 0.0
             if float(difference.abs().max()) > 1e-9 * scale:
                 raise ValueError(f"{self.name}: the Hamiltonian couples its components; a box needs a separable H")

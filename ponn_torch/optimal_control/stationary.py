@@ -8,14 +8,15 @@ exactly, because H_u vanishes there. The number of steps is fixed, so that it is
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from itertools import product
 from typing import Any
 
 import torch
 from torch import Tensor
-from torch.func import grad
 
+from ponn_torch.numerics.autodiff import gradients, gradients_and_values
 from ponn_torch.optimal_control.control_laws import Hamiltonian, Minimiser, Regime
 
 
@@ -63,6 +64,7 @@ class Stationary:
         inside = self.minimum + 0.37 * (self.maximum - self.minimum)
         return {self.name: inside * one.expand(*one.shape[:-1], self.size)}
 
+    @torch.no_grad()
     def adapted(self, h: Hamiltonian, cost: Hamiltonian, p: Any, one: Tensor, unit: float) -> Stationary:
         middle = self.probe(one)[self.name]
         size = sum(h(**{self.name: middle + shift}).abs() for shift in (0.0, 0.1, -0.1))
@@ -133,20 +135,20 @@ class Stationary:
         return best
 
     def _slope(self, h: Hamiltonian, u: Tensor) -> Tensor:
-        return grad(lambda u: h(**{self.name: u}).sum())(u)
+        return gradients(lambda u: h(**{self.name: u}), u)[0]
 
     def _derivatives(self, h: Hamiltonian, u: Tensor) -> tuple[Tensor, Tensor]:
         """H_u (..., m) and H_uu (..., m, m)."""
 
-        def component(i: int) -> Any:
-            def function(u: Tensor) -> tuple[Tensor, Tensor]:
+        def component(i: int) -> Callable[[Tensor], tuple[Tensor, tuple[Tensor]]]:
+            def function(u: Tensor) -> tuple[Tensor, tuple[Tensor]]:
                 slope = self._slope(h, u)
-                return slope[..., i].sum(), slope
+                return slope[..., i], (slope,)
 
             return function
 
-        rows = [grad(component(i), has_aux=True)(u) for i in range(self.size)]
-        return rows[0][1], torch.stack([row for row, _ in rows], -2)
+        rows = [gradients_and_values(component(i), u) for i in range(self.size)]
+        return rows[0][1][0], torch.stack([row for (row,), _ in rows], -2)
 
     def _solve(self, hessian: Tensor, slope: Tensor) -> Tensor:
         """|H_uu|⁻¹ H_u: downhill also where H is not convex; no step where H does not depend on u."""

@@ -269,7 +269,29 @@ def test_a_convex_box_is_clipped_component_by_component(slopes):
     pinned = law.minimise(h, NONE, column(1.0), Regime(arcs=codes))
     torch.testing.assert_close(pinned.control["u"], expected, rtol=1e-12, atol=1e-12)
     for code, value in zip(codes[0].tolist(), expected[0].tolist(), strict=True):
-        assert (code == INTERIOR) == (-0.5 < value < 1.0)
+        # S = 0 exactly at a bound belongs to either arc
+        assert (code == INTERIOR) == (-0.5 < value < 1.0) or 0.0 in best.switching
+
+
+def test_a_concave_hamiltonian_is_refused():
+    with pytest.raises(ValueError, match="u: the Hamiltonian is concave in component 1; allowed: affine or convex"):
+        adapted(Box("u", 1.0, -0.5, size=2), separable(ONE * tensor([1.0, 1.0]), tensor([1.0, -4.0])), None)
+    with pytest.raises(ValueError, match="thrust: the Hamiltonian is concave in its magnitude; allowed: affine or"):
+        adapted(ThrustBall("thrust", 2.0), throttle_energy(tensor([[0.0, 1.0, 0.0]]), -0.5), None)
+
+
+def test_a_vanishing_primer_takes_no_direction_and_stays_finite():
+    law = adapted(ThrustBall("thrust", 2.0, 0.5), thrust_hamiltonian(tensor([[0.0, 0.0, 1.0]])))
+    primer = tensor([[0.0, 0.0, 0.0], [0.0, 0.3, -0.4]]).requires_grad_()
+    with torch.enable_grad():
+        best = law.minimise(thrust_hamiltonian(primer), NONE, ONE[:2], Regime(smoothing=ONE[:2]))
+        total = sum(x.sum() for x in (*best.control.values(), best.switching))
+        (slopes,) = torch.autograd.grad(total, primer)
+    assert best.control["thrust"][0].tolist() == [0.0, 0.0, 0.0]
+    # S = (0 − α (1 − λm))/α
+    assert float(best.switching[0]) == pytest.approx(-0.6)
+    assert bool(slopes.isfinite().all())
+    assert float(best.switching[1]) == pytest.approx(0.5 / ALPHA - 0.6)
 
 
 def test_a_box_with_a_coupled_hamiltonian_is_refused():

@@ -102,7 +102,11 @@ def test_no_other_angle_is_better_though_there_are_local_minima(weights):
     one = torch.ones(1, 1, dtype=torch.float64)
     found = minimise(Stationary("angle", n_grid=24, n_newton=8, periodic=(True,)), h, one)
     everywhere = torch.linspace(-math.pi, math.pi, 4001, dtype=torch.float64)[:, None]
-    assert float(h(found)) <= float(h(everywhere).min()) + 1e-12
+    # minima closer than what a cell of the grid hides may be taken for each other: half its width squared, times H_uu
+    hidden = 0.5 * (math.pi / 24) ** 2 * (abs(a) + abs(b) + 4 * abs(c) + 4 * abs(d))
+    assert float(h(found)) <= float(h(everywhere).min()) + hidden
+    (slope,) = torch.func.vjp(h, found)[1](one)
+    assert abs(float(slope)) < 1e-10
     assert -math.pi <= float(found) <= math.pi
 
 
