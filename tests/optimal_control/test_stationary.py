@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from torch import Tensor
 from torch.func import jacrev, vjp, vmap
 
+from ponn_torch.numerics.autodiff import gradients
 from ponn_torch.optimal_control.control_laws import Regime
 from ponn_torch.optimal_control.stationary import Stationary
 
@@ -100,13 +101,12 @@ def test_no_other_angle_is_better_though_there_are_local_minima(weights):
         return a * torch.cos(angle) + b * torch.sin(angle) + c * torch.cos(2 * angle) + d * torch.sin(2 * angle)
 
     one = torch.ones(1, 1, dtype=torch.float64)
-    found = minimise(Stationary("angle", n_grid=24, n_newton=8, periodic=(True,)), h, one)
+    found = minimise(Stationary("angle", n_grid=24, n_newton=8, periodic=(True,)), h, one).detach()
     everywhere = torch.linspace(-math.pi, math.pi, 4001, dtype=torch.float64)[:, None]
     # minima closer than what a cell of the grid hides may be taken for each other: half its width squared, times H_uu
     hidden = 0.5 * (math.pi / 24) ** 2 * (abs(a) + abs(b) + 4 * abs(c) + 4 * abs(d))
     assert float(h(found)) <= float(h(everywhere).min()) + hidden
-    (slope,) = torch.func.vjp(h, found)[1](one)
-    assert abs(float(slope)) < 1e-10
+    assert abs(float(gradients(h, found)[0])) < 1e-10
     assert -math.pi <= float(found) <= math.pi
 
 
@@ -117,7 +117,7 @@ def test_a_minimum_outside_the_range_stays_on_its_edge_without_a_derivative():
     def angle(w: Tensor) -> Tensor:
         return minimise(law, steering(w), w[:, :1])
 
-    found = angle(costates)
+    found = angle(costates).detach()
     assert float(found[0]) == pytest.approx(math.atan2(-0.2, 1.0))
     assert float(found[1]) == 1.0
     assert not jacobian_by_vjp(angle, costates)[1].any()
