@@ -135,6 +135,7 @@ INSTEAD = {
     "polar": ["problem=earth_mars"],
     "split": ["refinement.max_rounds=1", "refinement.stopping.max_iterations=2"],
     "two_loop": ["refinement.max_rounds=1", "refinement.stopping.max_iterations=2"],
+    "split_mlp": ["refinement.max_rounds=1", "refinement.max_sharpenings=0", "refinement.stopping.max_iterations=2"],
     "subdivide": ["refinement.max_rounds=1", "refinement.stopping.max_iterations=2"],
     "custom": [REFERENCE],
     "adam_lbfgs": [f"optimizer.parts.{i}.stopping.max_iterations=2" for i in (0, 1)],

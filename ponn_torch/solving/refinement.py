@@ -17,7 +17,8 @@ from torch import Tensor
 
 from ponn_torch.ansatz.basis import FreeFunction, Legendre
 from ponn_torch.numerics.nodes import make_nodes
-from ponn_torch.optim.base import Callback, OptimizeResult, Stopping
+from ponn_torch.optim.base import Callback, Optimizer, OptimizeResult, Stopping
+from ponn_torch.optim.chain import Chain, OutputLayer
 from ponn_torch.optim.least_squares import LevenbergMarquardt
 from ponn_torch.optimal_control.collocation import Collocation
 from ponn_torch.optimal_control.curve import Curve
@@ -95,8 +96,10 @@ class Segmentation:
     def solve(
         self, collocation: Collocation, start: Curve, callback: MakeCallback | None
     ) -> tuple[Curve, OptimizeResult]:
-        """One round, from the projection of ``start``."""
-        optimizer = LevenbergMarquardt(self.stopping, damping=self.damping, linear_solver=self.linear_solver)
+        """One round, from the projection of ``start``; of networks the output layers are solved for last."""
+        optimizer: Optimizer = LevenbergMarquardt(self.stopping, damping=self.damping, linear_solver=self.linear_solver)
+        if len(collocation.linear_unknowns) < collocation.n_unknowns:
+            optimizer = Chain([optimizer, OutputLayer()])
         on_iteration = callback(collocation) if callback else None
         result = optimizer.run(collocation, project(collocation, start), on_iteration)
         return Curve(collocation, result.xi), result

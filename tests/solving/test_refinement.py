@@ -9,6 +9,7 @@ import torch
 from helpers import bvp_of, collocation
 
 from ponn_torch.ansatz.basis import Chebyshev
+from ponn_torch.ansatz.networks import MLP
 from ponn_torch.numerics.nodes import make_nodes
 from ponn_torch.optim.base import Status, Stopping
 from ponn_torch.optim.least_squares import LevenbergMarquardt
@@ -103,6 +104,15 @@ def test_every_round_of_a_split_calls_back_with_its_own_residual():
 
     refined = Split().run(smoothed("mars_landing", 0.1), callback)
     assert [count for _, count in seen] == [result.n_iterations for result in refined.rounds]
+
+
+def test_a_split_with_a_network_on_every_segment_finds_the_optimum():
+    refined = Split(basis=MLP((24,), first_scale=2.0), n_nodes=30).run(smoothed("mars_landing", 0.1))
+    assert refined.outcome is Outcome.SOLVED
+    solution = Solution(refined.curve)
+    assert solution.arcs == ["max", "min", "max"]
+    assert solution.cost == pytest.approx(268.0146563274, abs=1e-7)
+    assert solution.curve.collocation.linear_unknowns.shape[0] < solution.curve.collocation.n_unknowns
 
 
 def test_more_arcs_than_allowed_are_not_tried():
