@@ -22,6 +22,7 @@ ROOMS = (
     "ponn_torch.optimal_control.discretisation",
     "ponn_torch.optim",
     "ponn_torch.solving",
+    "ponn_torch.guidance",
 )
 # Fields of a Solver whose place in the config has another name.
 PLACES = {

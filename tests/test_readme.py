@@ -8,7 +8,9 @@ from typing import Any
 import pytest
 
 from ponn_torch.build import build
-from ponn_torch.cli.overrides import groups, read
+from ponn_torch.cli.flight import build as build_flight
+from ponn_torch.cli.overrides import PONN as PONN_APPLICATION
+from ponn_torch.cli.overrides import RHC, Application, groups, read
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
@@ -16,6 +18,7 @@ PYTHON = re.findall(r"^```python\n(.*?)^```", README, re.MULTILINE | re.DOTALL)
 SHELL = re.findall(r"^```sh\n(.*?)^```", README, re.MULTILINE | re.DOTALL)
 COMMANDS = [words for block in SHELL for line in block.splitlines() if (words := shlex.split(line, comments=True))]
 PONN = [words[1:] for words in COMMANDS if words[0] == "ponn"]
+GUIDE = [words[1:] for words in COMMANDS if words[0] == "ponn-rhc"]
 
 
 def test_python_runs_from_top_to_bottom(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -49,9 +52,19 @@ def test_commands_are_understood(arguments: list[str], tmp_path: Path, monkeypat
         build(command.config)
 
 
-def test_table_of_groups_is_complete() -> None:
-    rows = dict(re.findall(r"^\| `(\w+)` \| (.*)\|$", README, re.MULTILINE))
-    for name, options in groups().items():
+@pytest.mark.parametrize("arguments", GUIDE, ids=" ".join)
+def test_guidance_commands_are_understood(arguments: list[str]) -> None:
+    command = read(arguments, RHC)
+    assert command.multirun == ("-m" in arguments)
+    if command.config is not None:
+        build_flight(command.config)
+
+
+@pytest.mark.parametrize(("application", "header"), [(PONN_APPLICATION, "| group |"), (RHC, "| `ponn-rhc` |")])
+def test_table_of_groups_is_complete(application: Application, header: str) -> None:
+    table = README.partition(header)[2].partition("\n\n")[0]
+    rows = dict(re.findall(r"^\| `(\w+)` \| (.*)\|$", table, re.MULTILINE))
+    for name, options in groups(application).items():
         if name == "hydra":
             continue
         for option in set(options) - {"custom"}:  # which a reference stands for

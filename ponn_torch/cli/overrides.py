@@ -16,10 +16,27 @@ from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-CONFIG = "solve"
 SWITCHES = ("--multirun", "-m", "--resolve", "--info", "--hydra-help", "--shell-completion")
 WITH_VALUE = ("--cfg", "-c", "--package", "-p", "--info", "-i", "--config-dir", "-cd")
 VALUES = ("job", "hydra", "all", "config", "defaults", "defaults-tree", "plugins", "searchpath")
+
+
+@dataclass(frozen=True)
+class Application:
+    """A command: its name, its main config, the folder of its groups below the configs.
+
+    own_problem: whether ``problem=file.py:function`` is understood.
+    """
+
+    program: str
+    config: str
+    folder: str = "."
+    own_problem: bool = False
+
+
+PONN = Application("ponn", "solve", own_problem=True)
+RHC = Application("ponn-rhc", "track", "rhc")
+APPLICATIONS = {application.program: application for application in (PONN, RHC)}
 
 
 class InputError(ValueError):
@@ -39,19 +56,20 @@ class Command:
         return "-m" in self.options or "--multirun" in self.options
 
 
-def config_folder() -> Path:
+def config_folder(application: Application = PONN) -> Path:
     """Beside the package in an installation, at the top of the repository in a checkout."""
-    package = Path(__file__).resolve().parents[1]
-    for folder in (package / "configs", package.parent / "configs"):
-        if (folder / f"{CONFIG}.yaml").is_file():
+    package, name = Path(__file__).resolve().parents[1], f"{application.config}.yaml"
+    for configs in (package / "configs", package.parent / "configs"):
+        folder = (configs / application.folder).resolve()
+        if (folder / name).is_file():
             return folder
-    raise InputError(f"configs are missing: no {CONFIG}.yaml beside the package; install it again")
+    raise InputError(f"configs are missing: no {name} beside the package; install it again")
 
 
-def groups() -> dict[str, list[str]]:
+def groups(application: Application = PONN) -> dict[str, list[str]]:
     """Options per config group, in the order of the main config's defaults."""
-    folder = config_folder()
-    given = OmegaConf.load(folder / f"{CONFIG}.yaml")
+    folder = config_folder(application)
+    given = OmegaConf.load(folder / f"{application.config}.yaml")
     named = [str(key) for entry in given.defaults if isinstance(entry, DictConfig) for key in entry]
     return {name: sorted(path.stem for path in (folder / name).glob("*.yaml")) for name in named}
 
@@ -68,34 +86,36 @@ def one_line(text: Any) -> str:
 # -- reading ---------------------------------------------------------------------------------------
 
 
-def read(arguments: Sequence[str]) -> Command:
+def read(arguments: Sequence[str], application: Application = PONN) -> Command:
     """Take the command line apart and compose the config of a single run.
 
     Raises:
         InputError: an unknown option, a setting that does not exist, a value that no config is named after.
     """
     options, overrides = _split(arguments)
-    overrides = [part for text in overrides for part in _own_problem(text)]
+    if application.own_problem:
+        overrides = [part for text in overrides for part in _own_problem(text)]
     command = Command(options, overrides, None)
     if not options:
-        return Command(options, overrides, composed(overrides))
+        return Command(options, overrides, composed(overrides, application=application))
     if command.multirun:
-        _check(overrides)
+        _check(overrides, application)
     return command
 
 
-def composed(overrides: Sequence[str], with_hydra: bool = False) -> DictConfig:
+def composed(overrides: Sequence[str], with_hydra: bool = False, application: Application = PONN) -> DictConfig:
     """The config that overrides make of the main one; values may still be unresolved."""
     try:
-        return _compose(overrides, with_hydra)
+        return _compose(overrides, application, with_hydra)
     except (HydraException, OmegaConfBaseException, ValueError) as error:
-        _check(overrides)
+        _check(overrides, application)
         raise InputError(one_line(error)) from error
 
 
-def _compose(overrides: Sequence[str], with_hydra: bool = False) -> DictConfig:
-    with initialize_config_dir(str(config_folder()), job_name="ponn", version_base="1.3"):
-        return compose(CONFIG, list(overrides), return_hydra_config=with_hydra)
+def _compose(overrides: Sequence[str], application: Application, with_hydra: bool = False) -> DictConfig:
+    folder = str(config_folder(application))
+    with initialize_config_dir(folder, job_name=application.program, version_base="1.3"):
+        return compose(application.config, list(overrides), return_hydra_config=with_hydra)
 
 
 def _split(arguments: Sequence[str]) -> tuple[list[str], list[str]]:
@@ -138,10 +158,10 @@ def _quoted(text: str) -> str:
 # -- what is wrong ---------------------------------------------------------------------------------
 
 
-def _check(overrides: Sequence[str]) -> None:
+def _check(overrides: Sequence[str], application: Application) -> None:
     """Raise an InputError for the first override that names no setting or no config."""
     parsed = [_parsed(text) for text in overrides]
-    options, chosen = groups(), []
+    options, chosen = groups(application), []
     for override in parsed:
         name = override.key_or_group
         if name not in options:
@@ -149,12 +169,12 @@ def _check(overrides: Sequence[str]) -> None:
         values = _values(override)
         for value in values:
             if value not in options[name]:
-                extra = ", module:function, file.py:function" if name == "problem" else ""
+                extra = ", module:function, file.py:function" if name == "problem" and application.own_problem else ""
                 hint = nearest(str(value), options[name])
                 raise InputError(f"{name} = {value!r}; " + hint.replace(" (did", f"{extra} (did", 1))
         if values:
             chosen.append(f"{name}={values[0]}")
-    base = _compose(chosen, with_hydra=True)
+    base = _compose(chosen, application, with_hydra=True)
     for override in parsed:
         name = override.key_or_group
         plugin = name.startswith(("hydra/", "hydra.launcher."))  # Hydra knows what is installed

@@ -1,65 +1,29 @@
-"""One run in its folder: everything computed is kept there, whatever ends the run."""
+"""One solve in its folder: everything computed is kept there, whatever ends the run."""
 
 from __future__ import annotations
 
-import json
-import math
-import shutil
-import time
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import torch
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 
 from ponn_torch.build import Plan, build, resolved
+from ponn_torch.cli.job import DONE, INTERRUPTED, NOT_CERTIFIED, Outcome, run_job
+from ponn_torch.cli.overrides import PONN
+from ponn_torch.cli.session import Tool, sweep_member
 from ponn_torch.optimal_control.problem import DisplayUnit
-from ponn_torch.reporting.members import BESIDES, OUTCOME, SOLUTION
-from ponn_torch.reporting.recorder import Recorder, finite_or_none
-from ponn_torch.reporting.records import RECORDS, RunRecorder
+from ponn_torch.reporting.members import BESIDES, SOLUTION
+from ponn_torch.reporting.recorder import Recorder
+from ponn_torch.reporting.records import RunRecorder
 from ponn_torch.reporting.reference import Reference
-from ponn_torch.reporting.report import (
-    CERTIFICATE,
-    ENVIRONMENT,
-    FAILURE,
-    FAILURE_TEXT,
-    FIGURES,
-    REPORT,
-    write_failure,
-    write_report,
-)
+from ponn_torch.reporting.report import write_report
 from ponn_torch.settings import ConfigError, one_line
 from ponn_torch.solving.certificate import Certificate
 from ponn_torch.solving.observer import StageResult
 from ponn_torch.solving.solution import Solution
-
-DONE, BAD_INPUT, NOT_CERTIFIED, BUG, INTERRUPTED = 0, 1, 2, 3, 130
-CONFIG, OVERRIDES = "config.yaml", "overrides.yaml"
-FILES = (CONFIG, OVERRIDES, OUTCOME, RECORDS, REPORT, ENVIRONMENT, CERTIFICATE, FAILURE, FAILURE_TEXT)
-
-
-@dataclass(frozen=True)
-class Outcome:
-    """How a run ended, as outcome.json says it; cost in the user's units, times in s."""
-
-    exit_code: int
-    message: str
-    certified: bool = False
-    cost: float | None = None
-    known_cost: float | None = None
-    final_time: float | None = None
-    switch_times: list[float] = field(default_factory=list)
-    arcs: list[str] = field(default_factory=list)
-    n_starts: int = 0
-    cpu_seconds: float = 0.0
-    overrides: list[str] = field(default_factory=list)
-
-    @property
-    def score(self) -> float:
-        """What a sweep optimises: the cost of a certified solution, else infinity."""
-        return self.cost if self.certified and self.cost is not None else math.inf
 
 
 class _Keeper(Recorder):
@@ -97,36 +61,7 @@ def run(
 
     ``plan`` is used if it was built from the same config. ``choices`` name the config of each group.
     """
-    folder.mkdir(parents=True, exist_ok=True)
-    _clear(folder)
-    keeper, began = _Keeper(), time.process_time()
-    error: BaseException | None = None
-    try:
-        _write_text(folder / OVERRIDES, OmegaConf.to_yaml(OmegaConf.create(list(overrides))))
-        if plan is None or resolved(config) != plan.settings:
-            plan = build(config)
-        _write_text(folder / CONFIG, OmegaConf.to_yaml(OmegaConf.create(plan.settings)))
-        outcome = _solve(plan, folder, keeper, _told_apart(plan, overrides, choices or {}))
-    except ConfigError as wrong:
-        outcome = Outcome(BAD_INPUT, str(wrong))
-    except KeyboardInterrupt:
-        outcome = Outcome(INTERRUPTED, "interrupted; what was computed so far is kept")
-    except Exception as bug:
-        error, outcome = bug, Outcome(BUG, f"{type(bug).__name__}: {one_line(bug)}")
-    outcome = _completed(outcome, keeper, overrides, time.process_time() - began)
-    if outcome.exit_code != DONE:
-        write_failure(folder, outcome.message, error)
-    try:
-        _kept(outcome, plan, folder, keeper)
-    except Exception as bug:
-        outcome = _replaced(outcome, BUG, f"{type(bug).__name__}: {one_line(bug)}")
-        write_failure(folder, outcome.message, bug)
-    except KeyboardInterrupt:
-        outcome = _replaced(outcome, INTERRUPTED, "interrupted while the report was written")
-        write_failure(folder, outcome.message)
-    _write_text(folder / OUTCOME, json.dumps(finite_or_none(asdict(outcome)), indent=2, ensure_ascii=False) + "\n")
-    print(_screen(outcome, folder, plan, keeper, time.process_time() - began), flush=True)
-    return outcome
+    return run_job(SolveJob(config, folder, overrides, plan, choices or {}), folder, overrides)
 
 
 def _told_apart(plan: Plan, overrides: Sequence[str], choices: Mapping[str, Any]) -> dict[str, Any]:
@@ -136,30 +71,6 @@ def _told_apart(plan: Plan, overrides: Sequence[str], choices: Mapping[str, Any]
     chosen = {group: choices[group] for group in ("ansatz", "optimizer") if group in choices}
     told = chosen | {"problem": plan.problem.name, "seed": plan.seed}
     return told | {key: value for key, value in changed.items() if key not in told and key.split(".")[0] not in BESIDES}
-
-
-def _solve(plan: Plan, folder: Path, keeper: _Keeper, told: Mapping[str, Any]) -> Outcome:
-    recording = plan.recording
-    torch.set_num_threads(plan.threads)
-    recorder = RunRecorder(
-        folder,
-        settings=told,
-        cost_name=plan.problem.cost_name,
-        tensorboard=recording.tensorboard,
-        progress=recording.progress,
-        cost_every=recording.cost_every,
-        figures=recording.stage_figures,
-        reference=_reference(plan),
-        extra=(keeper,),
-    )
-    with recorder:
-        result = plan.solver.solve(plan.problem, plan.seed, recorder)
-    code = DONE if result.certified else NOT_CERTIFIED
-    if plan.solver.refinement is None and result.solution is not None and result.certificate is not None:
-        code = DONE  # a smoothed solution was asked for; what it is worth stands in its certificate
-    if result.interrupted:
-        code = INTERRUPTED
-    return Outcome(code, result.message)
 
 
 def _reference(plan: Plan) -> Reference | None:
@@ -179,60 +90,90 @@ def _reference(plan: Plan) -> Reference | None:
         raise ConfigError(f"record.reference = {plan.recording.reference!r}: {one_line(error)}") from error
 
 
-def _completed(outcome: Outcome, keeper: _Keeper, overrides: Sequence[str], seconds: float) -> Outcome:
-    """The outcome with what the solver told."""
-    values: dict[str, Any] = {"overrides": list(overrides), "cpu_seconds": seconds}
-    values["n_starts"] = max((stage.start + 1 for stage in keeper.stages), default=0)
-    if keeper.judged is not None:
-        values |= {"certified": keeper.judged.certified}
-    best = keeper.best
-    if best is not None:
-        values |= {"cost": best.cost, "known_cost": best.problem.known_cost, "final_time": best.final_time}
-        values |= {"switch_times": best.switch_times, "arcs": best.arcs}
-    return Outcome(**asdict(outcome) | values)
+def member(config: DictConfig) -> float:
+    """One member of a sweep."""
+    return sweep_member(TOOL, config)
 
 
-def _replaced(outcome: Outcome, code: int, message: str) -> Outcome:
-    return Outcome(**asdict(outcome) | {"exit_code": code, "message": message})
+class SolveJob:
+    """Solves an optimal control problem."""
 
+    def __init__(
+        self, config: DictConfig, folder: Path, overrides: Sequence[str], plan: Plan | None, choices: Mapping[str, Any]
+    ) -> None:
+        self._config, self._folder, self._plan = config, folder, plan
+        self._overrides, self._choices = overrides, choices
+        self._keeper = _Keeper()
 
-def _kept(outcome: Outcome, plan: Plan | None, folder: Path, keeper: _Keeper) -> None:
-    """Save the best solution and write the report; the figures last, for they are most likely to fail."""
-    best = keeper.best
-    if best is not None:
-        best.save(folder / SOLUTION)
-    figures = plan is not None and plan.recording.figures and best is not None
-    if figures:
-        print("drawing the figures …", flush=True)
-    for with_figures in (False, True) if figures else (False,):
-        write_report(
-            folder,
-            solution=best,
-            certificate=keeper.judged,
-            stages=keeper.stages,
-            settings=plan.settings if plan is not None else None,
-            message=outcome.message,
-            figures=with_figures,
+    def prepare(self) -> Mapping[str, Any]:
+        if self._plan is None or resolved(self._config) != self._plan.settings:
+            self._plan = None
+            self._plan = build(self._config)
+        return self._plan.settings
+
+    def work(self) -> Outcome:
+        plan = self._plan
+        assert plan is not None
+        recording = plan.recording
+        torch.set_num_threads(plan.threads)
+        recorder = RunRecorder(
+            self._folder,
+            settings=_told_apart(plan, self._overrides, self._choices),
+            cost_name=plan.problem.cost_name,
+            tensorboard=recording.tensorboard,
+            progress=recording.progress,
+            cost_every=recording.cost_every,
+            figures=recording.stage_figures,
+            reference=_reference(plan),
+            extra=(self._keeper,),
+        )
+        with recorder:
+            result = plan.solver.solve(plan.problem, plan.seed, recorder)
+        code = DONE if result.certified else NOT_CERTIFIED
+        if plan.solver.refinement is None and result.solution is not None and result.certificate is not None:
+            code = DONE  # a smoothed solution was asked for; what it is worth stands in its certificate
+        if result.interrupted:
+            code = INTERRUPTED
+        return Outcome(code, result.message)
+
+    def completed(self, outcome: Outcome) -> Outcome:
+        """The outcome with what the solver told."""
+        keeper, best = self._keeper, self._keeper.best
+        outcome = replace(outcome, n_starts=max((stage.start + 1 for stage in keeper.stages), default=0))
+        if keeper.judged is not None:
+            outcome = replace(outcome, certified=keeper.judged.certified)
+        if best is None:
+            return outcome
+        return replace(
+            outcome,
+            cost=best.cost,
+            known_cost=best.problem.known_cost,
+            final_time=best.final_time,
+            switch_times=best.switch_times,
+            arcs=best.arcs,
         )
 
+    def keep(self, outcome: Outcome) -> None:
+        """Save the best solution and write the report; the figures last, for they are most likely to fail."""
+        plan, best = self._plan, self._keeper.best
+        if best is not None:
+            best.save(self._folder / SOLUTION)
+        figures = plan is not None and plan.recording.figures and best is not None
+        if figures:
+            print("drawing the figures …", flush=True)
+        for with_figures in (False, True) if figures else (False,):
+            write_report(
+                self._folder,
+                solution=best,
+                certificate=self._keeper.judged,
+                stages=self._keeper.stages,
+                settings=plan.settings if plan is not None else None,
+                message=outcome.message,
+                figures=with_figures,
+            )
 
-# -- files and words -------------------------------------------------------------------------------
-
-
-def _clear(folder: Path) -> None:
-    """Remove what an earlier run left here, and nothing else."""
-    if not (folder / OUTCOME).exists() and not (folder / RECORDS).exists():
-        return
-    for name in FILES:
-        (folder / name).unlink(missing_ok=True)
-    for events in folder.glob("events.out.tfevents.*"):
-        events.unlink()
-    for name in (SOLUTION, FIGURES):
-        shutil.rmtree(folder / name, ignore_errors=True)
-
-
-def _write_text(path: Path, text: str) -> None:
-    path.write_text(text, encoding="utf-8")
+    def screen(self, outcome: Outcome, seconds: float) -> str:
+        return _screen(outcome, self._folder, self._plan, self._keeper, seconds)
 
 
 def _screen(outcome: Outcome, folder: Path, plan: Plan | None, keeper: _Keeper, seconds: float) -> str:
@@ -273,3 +214,6 @@ def _screen(outcome: Outcome, folder: Path, plan: Plan | None, keeper: _Keeper, 
     if outcome.exit_code != DONE and (certificate is None or outcome.message != certificate.verdict):
         lines.append(f"{'ended':12}{outcome.message}")
     return "\n".join(lines)
+
+
+TOOL = Tool(PONN, build, run, member)

@@ -8,8 +8,9 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -19,27 +20,39 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import DictConfig, OmegaConf
 
-from ponn_torch.build import Plan, build
-from ponn_torch.cli.overrides import CONFIG, Command, InputError, composed, config_folder
-from ponn_torch.cli.run import Outcome, run
+from ponn_torch.cli.job import BUG, INTERRUPTED, Outcome
+from ponn_torch.cli.overrides import Application, Command, InputError, composed, config_folder
 from ponn_torch.reporting.members import OUTCOME, natural
 from ponn_torch.settings import ConfigError
 
-BUG, BAD_INPUT, INTERRUPTED = 3, 1, 130
+
+@dataclass(frozen=True)
+class Tool:
+    """What a command does: ``build`` makes a plan of a config, ``run`` carries it out in a folder.
+
+    ``run`` is told the overrides, and the config chosen in each group.
+
+    member: the same for one member of a sweep, a function of a module, so that launchers can send it to processes.
+    """
+
+    application: Application
+    build: Callable[[DictConfig], Any]
+    run: Callable[[DictConfig, Path, Sequence[str], Any, Mapping[str, Any]], Outcome]
+    member: Callable[[DictConfig], float]
 
 
-def execute(command: Command) -> int:
+def execute(command: Command, tool: Tool) -> int:
     """Run what was asked and answer with the exit code.
 
     Raises:
         InputError: no run can be made of the settings; members of a sweep keep that to themselves.
     """
     if command.multirun:
-        return _sweep(command)
-    plan: Plan | None = None
+        return _sweep(command, tool)
+    plan: Any = None
     if command.config is not None:
         try:
-            plan = build(command.config)
+            plan = tool.build(command.config)
         except ConfigError as error:
             raise InputError(error) from error
         except Exception:  # a slip in a user's problem: the run itself meets it again and keeps the traceback
@@ -47,26 +60,28 @@ def execute(command: Command) -> int:
     outcomes: list[Outcome] = []
 
     def task(config: DictConfig) -> float:
-        outcome = _member(config, plan)
+        outcome = _member(tool, config, plan)
         outcomes.append(outcome)
         return outcome.score
 
     with _termination_interrupts():
-        _under_hydra(task, command.options, command.overrides)
+        _under_hydra(tool.application, task, command.options, command.overrides)
     return outcomes[0].exit_code if outcomes else 0
 
 
-def _member(config: DictConfig, plan: Plan | None = None) -> Outcome:
+def _member(tool: Tool, config: DictConfig, plan: Any = None) -> Outcome:
     about = HydraConfig.get()
-    return run(config, Path(about.runtime.output_dir), list(about.overrides.task), plan, about.runtime.choices)
+    folder, overrides = Path(about.runtime.output_dir), list(about.overrides.task)
+    return tool.run(config, folder, overrides, plan, about.runtime.choices)
 
 
-def _under_hydra(task: Any, options: list[str], overrides: list[str]) -> None:
+def _under_hydra(application: Application, task: Any, options: list[str], overrides: list[str]) -> None:
     """Call Hydra as from a command line."""
     before = sys.argv
-    sys.argv = ["ponn", *options, *overrides]
+    sys.argv = [application.program, *options, *overrides]
+    folder, name = str(config_folder(application)), application.config
     try:
-        hydra.main(config_path=str(config_folder()), config_name=CONFIG, version_base="1.3")(task)()
+        hydra.main(config_path=folder, config_name=name, version_base="1.3")(task)()
     finally:
         sys.argv = before
 
@@ -91,7 +106,7 @@ def _termination_interrupts() -> Iterator[None]:
 # -- sweeps ----------------------------------------------------------------------------------------
 
 
-def sweep_member(config: DictConfig) -> float:
+def sweep_member(tool: Tool, config: DictConfig) -> float:
     """Run one member of a sweep; the cost of a certified solution, else infinity.
 
     Raises:
@@ -99,7 +114,7 @@ def sweep_member(config: DictConfig) -> float:
     """
     job = HydraConfig.get().job
     print(f"\n[{job.num}] {job.override_dirname}", flush=True)
-    outcome = _member(config)
+    outcome = _member(tool, config)
     folder = Path(HydraConfig.get().runtime.output_dir)
     verdict = "certified" if outcome.certified else "not certified" if outcome.exit_code in (0, 2) else "failed"
     print(f"[{job.num}] {verdict}; {len(list(folder.parent.rglob(OUTCOME)))} members done", flush=True)
@@ -108,9 +123,10 @@ def sweep_member(config: DictConfig) -> float:
     return outcome.score
 
 
-def _sweep(command: Command) -> int:
+def _sweep(command: Command, tool: Tool) -> int:
     # the folder is fixed here, so that it is known whatever becomes of the members
-    about = composed([text for text in command.overrides if _plain(text)], with_hydra=True)
+    plain = [text for text in command.overrides if _plain(text)]
+    about = composed(plain, with_hydra=True, application=tool.application)
     folder = Path(str(OmegaConf.select(about, "hydra.sweep.dir")))
     overrides = [text for text in command.overrides if not text.startswith("hydra.sweep.dir=")]
     if not any(text.startswith("hydra.sweep.subdir=") for text in overrides):
@@ -119,7 +135,8 @@ def _sweep(command: Command) -> int:
     began, interrupted = time.time(), False
     try:
         with _termination_interrupts():
-            _under_hydra(sweep_member, command.options, [*overrides, f"hydra.sweep.dir='{name}'"])
+            overrides = [*overrides, f"hydra.sweep.dir='{name}'"]
+            _under_hydra(tool.application, tool.member, command.options, overrides)
     except KeyboardInterrupt:
         interrupted = True
     found = [path for path in folder.rglob(OUTCOME) if path.stat().st_mtime >= began - 1]

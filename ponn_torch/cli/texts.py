@@ -1,4 +1,4 @@
-"""What ``ponn --help``, ``--config-groups`` and ``--version`` say."""
+"""What ``--help``, ``--config-groups`` and ``--version`` say."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ from collections.abc import Callable
 from pathlib import Path
 
 from ponn_torch import __version__
-from ponn_torch.cli.overrides import config_folder, groups
+from ponn_torch.cli.overrides import PONN, RHC, Application, config_folder, groups
 
-USAGE = """\
+SOLVE = """\
 ponn: solve an optimal control problem by a Pontryagin neural network, fly the solution and certify it.
 
   ponn [GROUP=CONFIG ...] [KEY=VALUE ...] [-m]
@@ -37,6 +37,33 @@ Exit code: 0 certified (with refinement=none: finished), 1 bad input, 2 not cert
 130 interrupted.\
 """
 
+GUIDE = """\
+ponn-rhc: track a reference in closed loop, each control from the solution of a horizon's boundary value problem.
+
+  ponn-rhc [GROUP=CONFIG ...] [KEY=VALUE ...] [-m]
+
+Examples
+  ponn-rhc                                            rendezvous on a circular orbit
+  ponn-rhc problem=quadrotor passes=newton            a manoeuvre, Newton's method on every horizon
+  ponn-rhc problem=shuttle n_vehicles=500             entry, and a Monte Carlo of 500 vehicles
+  ponn-rhc problem=quadrotor method=rbf_swarm         Gaussians tuned by a particle swarm
+  ponn-rhc problem.horizon=70 ending=shrink           other data
+  ponn-rhc -m method=chebyshev,igpm,rbf               a sweep
+
+Config groups (GROUP=CONFIG; the first line of each config: ponn-rhc --config-groups)
+{groups}
+
+Settings of the chosen configs (KEY=VALUE): ponn-rhc --cfg job [GROUP=CONFIG ...]
+Other options: -m sweep over lists of values, --config-groups, --version, --hydra-help
+
+A run leaves in its folder: config.yaml, overrides.yaml, records.jsonl, TensorBoard events, flight/,
+certificate.json, figures/, report.md, environment.json, outcome.json; failure.txt if something went wrong.
+
+Exit code: 0 certified, 1 bad input, 2 not certified, 3 an error inside, 130 interrupted.\
+"""
+
+USAGES = {PONN: SOLVE, RHC: GUIDE}
+
 
 def first_comment(path: Path) -> str:
     """The line that opens a config."""
@@ -44,29 +71,31 @@ def first_comment(path: Path) -> str:
     return line.removeprefix("#").strip() if line.startswith("#") else ""
 
 
-def _shown_groups() -> dict[str, list[str]]:
-    return {name: options for name, options in groups().items() if name != "hydra" and options}
+def _shown_groups(application: Application) -> dict[str, list[str]]:
+    return {name: options for name, options in groups(application).items() if name != "hydra" and options}
 
 
-def usage() -> str:
+def usage(application: Application) -> str:
     lines = []
-    for name, options in _shown_groups().items():
+    for name, options in _shown_groups(application).items():
         text = ", ".join(options)
         lines.append(textwrap.fill(text, 110, initial_indent=f"  {name:14}", subsequent_indent=" " * 16))
-    return USAGE.format(groups="\n".join(lines))
+    return USAGES[application].format(groups="\n".join(lines))
 
 
-def config_groups() -> str:
-    lines = []
-    for name, options in _shown_groups().items():
+def config_groups(application: Application) -> str:
+    lines, folder = [], config_folder(application)
+    for name, options in _shown_groups(application).items():
         lines.append(name)
-        lines += [f"  {option:24}{first_comment(config_folder() / name / f'{option}.yaml')}" for option in options]
+        lines += [f"  {option:24}{first_comment(folder / name / f'{option}.yaml')}" for option in options]
     return "\n".join(lines)
 
 
-TEXTS: dict[str, Callable[[], str]] = {
-    "--help": usage,
-    "-h": usage,
-    "--config-groups": config_groups,
-    "--version": lambda: f"ponn-torch {__version__}",
-}
+def texts(application: Application) -> dict[str, Callable[[], str]]:
+    """What an option prints."""
+    return {
+        "--help": lambda: usage(application),
+        "-h": lambda: usage(application),
+        "--config-groups": lambda: config_groups(application),
+        "--version": lambda: f"ponn-torch {__version__}",
+    }

@@ -159,3 +159,29 @@ class TensorBoard(Recorder):
         if not self._failed:  # what torch prepares says success; a session without an end reads as unknown
             self._add(self._end, self._step)
         self._writer.close()
+
+
+class Scalars:
+    """Numbers of nested mappings under their dotted names, with hyperparameters in the same writer."""
+
+    def __init__(self, folder: Path, settings: Mapping[str, Any], metrics: tuple[str, ...]) -> None:
+        self._writer = SummaryWriter(str(folder), flush_secs=10)
+        experiment, begin, self._end = hparams(_hyperparameters(settings), dict.fromkeys(metrics, 0.0))
+        for summary in (experiment, begin):
+            self._writer._get_file_writer().add_summary(summary, 0)
+        self._step, self._failed = 0, False
+
+    def write(self, values: Mapping[str, Any], step: int) -> None:
+        """One event for all numbers of a step."""
+        self._step = step
+        entries = [Summary.Value(tag=tag, simple_value=value) for tag, value in _numbers(values).items()]
+        self._writer._get_file_writer().add_summary(Summary(value=entries), step)
+
+    def failed(self, reason: str) -> None:
+        self._failed = True
+        self._writer.add_text("failure", reason, self._step)
+
+    def close(self) -> None:
+        if not self._failed:
+            self._writer._get_file_writer().add_summary(self._end, self._step)
+        self._writer.close()

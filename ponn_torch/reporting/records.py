@@ -40,7 +40,7 @@ class JsonLines(Recorder):
         path.parent.mkdir(parents=True, exist_ok=True)
         self._stream = path.open("w", encoding="utf-8", buffering=1)
 
-    def _write(self, event: str, **values: Any) -> None:
+    def write(self, event: str, **values: Any) -> None:
         line = {"event": event} | values
         try:
             text = json.dumps(line, allow_nan=False)
@@ -49,21 +49,21 @@ class JsonLines(Recorder):
         self._stream.write(text + "\n")
 
     def stage_started(self, name: str, smoothing: float | None, index: int) -> None:
-        self._write("stage_started", name=name, smoothing=smoothing, index=index)
+        self.write("stage_started", name=name, smoothing=smoothing, index=index)
 
     def iteration(self, record: Record, look: Look) -> None:
         value = look.cost()
         known = {"cost": value} if math.isfinite(value) else {}
-        self._write("iteration", **record, residual=dict(look.blocks()), **known)
+        self.write("iteration", **record, residual=dict(look.blocks()), **known)
 
     def stage_ended(self, stage: StageResult) -> None:
-        self._write("stage", **stage_entry(stage))
+        self.write("stage", **stage_entry(stage))
 
     def certificate(self, certificate: Certificate) -> None:
-        self._write("certificate", **certificate.to_dict())
+        self.write("certificate", **certificate.to_dict())
 
     def failed(self, reason: str) -> None:
-        self._write("failure", reason=reason)
+        self.write("failure", reason=reason)
 
     def close(self) -> None:
         self._stream.close()

@@ -83,7 +83,7 @@ def environment() -> dict[str, Any]:
 def write_environment(folder: Path | str) -> dict[str, Any]:
     """Write environment.json."""
     found = environment()
-    _write_json(Path(folder) / ENVIRONMENT, found)
+    write_json(Path(folder) / ENVIRONMENT, found)
     return found
 
 
@@ -106,7 +106,7 @@ def write_failure(folder: Path | str, reason: str, error: BaseException | None =
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     kind, frames = (type(error).__name__, _frames(error)) if error is not None else (None, [])
-    _write_json(folder / FAILURE, {"reason": reason, "exception": kind, "frames": frames})
+    write_json(folder / FAILURE, {"reason": reason, "exception": kind, "frames": frames})
     lines = [reason, *([f"raised as {kind}"] if kind else []), *(f"  {frame}" for frame in frames)]
     (folder / FAILURE_TEXT).write_text("\n".join(lines) + "\n", encoding="utf-8")
 
@@ -138,22 +138,22 @@ def write_report(
             save(figure, folder / FIGURES / f"{name}.png")
             drawn.append(name)
     if certificate is not None:
-        _write_json(folder / CERTIFICATE, certificate.to_dict())
+        write_json(folder / CERTIFICATE, certificate.to_dict())
     parts = [
         _title(solution, certificate, message),
         _result(solution) if solution is not None else "",
         _certificate(certificate) if certificate is not None else "",
         _stages(stages, solution),
         _figures(drawn),
-        _settings(settings or {}),
-        _environment_line(found),
+        settings_text(settings or {}),
+        environment_line(found),
     ]
     path = folder / REPORT
     path.write_text("\n\n".join(part for part in parts if part) + "\n", encoding="utf-8")
     return path
 
 
-def _write_json(path: Path, values: Mapping[str, Any]) -> None:
+def write_json(path: Path, values: Mapping[str, Any]) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     text = json.dumps(finite_or_none(values), indent=2, ensure_ascii=False, allow_nan=False)
     path.write_text(text + "\n", encoding="utf-8")
@@ -257,14 +257,14 @@ def _figures(drawn: Sequence[str]) -> str:
     return "## Figures\n\n" + "\n\n".join(shown)
 
 
-def _settings(settings: Mapping[str, Any]) -> str:
+def settings_text(settings: Mapping[str, Any]) -> str:
     if not settings:
         return ""
     text = json.dumps(finite_or_none(settings), indent=2, ensure_ascii=False)
     return f"## Settings\n\n```json\n{text}\n```"
 
 
-def _environment_line(found: Mapping[str, Any]) -> str:
+def environment_line(found: Mapping[str, Any]) -> str:
     at = f" at {found['commit']}" if found["commit"] else ""
     versions = ", ".join(f"{name} {found[name]}" for name in ("python", "torch", "numpy", "scipy"))
     return (

@@ -1,0 +1,206 @@
+"""What a controller's decisions are worth: the true error of the control at the start of a horizon.
+
+A square system is solved to round-off by any basis, so that its loss tells nothing. Here decisions of a flight are made
+again by an oracle, from the same measured states: matrix exponential for linear plants about a fixed point, a fine
+Riccati sweep where a horizon is expanded around the reference once, solve_bvp of the nonlinear system otherwise.
+"""
+
+from __future__ import annotations
+
+import statistics
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from ponn_torch.guidance.closed_loop import Flight
+from ponn_torch.guidance.controllers import Timetable
+from ponn_torch.guidance.expansion import expand
+from ponn_torch.guidance.oracles import exponential_gain, nonlinear_control, riccati_sweep
+from ponn_torch.guidance.producers import Planner
+from ponn_torch.guidance.tracking import Setpoint, TrackingProblem
+
+Oracle = Callable[[Planner, list[float], list[float], Tensor], Tensor]  # starts, durations, x (S, n) -> u (S, m)
+STEPS = 600  # of the sweep: its error is then below 1e-9 of the gain for horizons with fast modes at rate 30/horizon
+
+
+def by_exponential(planner: Planner, starts: list[float], durations: list[float], x: Tensor) -> Tensor:
+    """Constant coefficients: one gain per length of horizon."""
+    problem, zero = planner.problem, x.new_zeros(1)
+    made = expand(problem, zero, *problem.reference(zero))
+    terminal, offset = _terminal(problem, zero[0])
+    gains = {
+        length: exponential_gain(made.matrix[0], made.drift[0], length, terminal, offset) for length in set(durations)
+    }
+    costates = torch.stack(
+        [gains[length][0] @ state + gains[length][1] for length, state in zip(durations, x, strict=True)]
+    )
+    return made.control(torch.cat([x, costates], -1))
+
+
+def by_sweep(planner: Planner, starts: list[float], durations: list[float], x: Tensor) -> Tensor:
+    """All horizons swept at once; the expansions are tabulated first, at every half step."""
+    problem = planner.problem
+    begin, length = x.new_tensor(starts), x.new_tensor(durations)
+    fractions = torch.linspace(0.0, 1.0, 2 * STEPS + 1, dtype=x.dtype)
+    t = begin + fractions.unsqueeze(-1) * length  # (2 STEPS + 1, S)
+    made = expand(problem, t, *problem.reference(t))
+    scale = length[:, None, None]  # in units of each horizon
+
+    def system(fraction: Tensor) -> tuple[Tensor, Tensor]:
+        at = round(float(fraction) * 2 * STEPS)
+        return made.matrix[at] * scale, made.drift[at] * scale[..., 0]
+
+    terminal, offset = _terminal(problem, t[-1])
+    terminal = terminal.expand(len(x), -1, -1)
+    gain, rest = riccati_sweep(system, fractions[::2], terminal, offset.expand(len(x), -1))
+    y = torch.cat([x, (gain @ x.unsqueeze(-1)).squeeze(-1) + rest], -1)
+    return (made.control_gain[0] @ y.unsqueeze(-1)).squeeze(-1) + made.control_offset[0]
+
+
+def by_boundary_value_solver(planner: Planner, starts: list[float], durations: list[float], x: Tensor) -> Tensor:
+    """One after the other."""
+    return torch.stack(
+        [
+            nonlinear_control(planner.problem, planner.plan(start, state, length), state)
+            for start, length, state in zip(starts, durations, x, strict=True)
+        ]
+    )
+
+
+def _terminal(problem: TrackingProblem, end: Tensor) -> tuple[Tensor, Tensor]:
+    weight = problem.terminal_weight
+    n = len(problem.initial)
+    if weight is None:
+        return problem.initial.new_zeros(n, n), problem.initial.new_zeros(n)
+    offset = problem.terminal_offset(end)
+    assert offset is not None
+    return weight, offset
+
+
+ORACLES: dict[str, Oracle] = {
+    "matrix exponential": by_exponential,
+    "Riccati sweep": by_sweep,
+    "solve_bvp": by_boundary_value_solver,
+}
+
+
+def oracle_of(planner: Planner) -> str:
+    """The name in ORACLES of what answers the question that the planner asks."""
+    if planner.problem.plant.linear and isinstance(planner.problem.reference, Setpoint):
+        return "matrix exponential"
+    return "Riccati sweep" if planner.passes.most == 1 or planner.problem.plant.linear else "solve_bvp"
+
+
+# -- certificate -------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class GuidanceCertificate:
+    """What was found when a flight's decisions were made again; lists are per checked cycle.
+
+    control_errors: ‖u0 − oracle‖/‖oracle‖. off_node_residuals, losses: of the same horizons. final_errors: |state −
+    reference| at the end, in the units that people read. peaks: largest value of each of the plant's limits.
+    """
+
+    oracle: str
+    cycles: list[int]
+    control_errors: list[float]
+    off_node_residuals: list[float]
+    losses: list[float]
+    n_cycles: int
+    n_late: int
+    saturated: float
+    final_errors: Mapping[str, float]
+    peaks: Mapping[str, float] = field(default_factory=dict)
+    allowed: float = 1e-2
+    completed: bool = True
+
+    @property
+    def largest_error(self) -> float:
+        return max(self.control_errors, default=float("nan"))
+
+    @property
+    def median_error(self) -> float:
+        return statistics.median(self.control_errors) if self.control_errors else float("nan")
+
+    @property
+    def certified(self) -> bool:
+        """Flown to the end, and every checked decision within what is allowed of the oracle's."""
+        return self.completed and bool(self.control_errors) and self.largest_error <= self.allowed
+
+    @property
+    def verdict(self) -> str:
+        if not self.completed:
+            return "not certified: the flight was interrupted"
+        if not self.control_errors:
+            return "not certified: no decision was checked"
+        if self.certified:
+            return f"certified: every checked control is within {self.allowed:g} of the {self.oracle}'s"
+        return (
+            f"not certified: a control is {self.largest_error:.2g} off the {self.oracle}'s; allowed: {self.allowed:g}"
+        )
+
+    def to_dict(self) -> dict[str, Any]:
+        told = ("certified", "verdict", "largest_error", "median_error")
+        return asdict(self) | {name: getattr(self, name) for name in told}
+
+    def to_text(self) -> str:
+        rows = [
+            ("control at the start against the oracle, median", f"{self.median_error:.2e}", ""),
+            ("control at the start against the oracle, largest", f"{self.largest_error:.2e}", f"{self.allowed:.1e}"),
+            ("residual between the nodes, largest", f"{max(self.off_node_residuals, default=float('nan')):.2e}", ""),
+            ("loss at the nodes, largest", f"{max(self.losses, default=float('nan')):.2e}", ""),
+            ("decisions replaced (late or not finite)", f"{self.n_late} of {self.n_cycles}", ""),
+            ("cycles with a saturated control", f"{100 * self.saturated:.1f} %", ""),
+            *((f"largest {name}, over its limit", f"{peak:.5f}", "") for name, peak in self.peaks.items()),
+        ]
+        head = f"check ({len(self.cycles)} cycles)"
+        lines = [self.verdict, "", f"{head:52}{'measured':>12}{'allowed':>12}"]
+        return "\n".join([*lines, *(f"{name:52}{measured:>12}{limit:>12}".rstrip() for name, measured, limit in rows)])
+
+
+def certify(
+    flight: Flight, planner: Planner, table: Timetable, *, n_samples: int = 25, allowed: float = 1e-2
+) -> GuidanceCertificate:
+    """Check decisions evenly spread over the flight of one vehicle, those replaced by a fallback left out."""
+    plant = flight.problem.plant
+    candidates = [k for k in range(flight.n_cycles) if not bool(flight.late[k])]
+    cycles = sorted({candidates[round(i)] for i in _spread(len(candidates), n_samples)})
+    errors: list[float] = []
+    residuals: list[float] = []
+    losses: list[float] = []
+    name = oracle_of(planner)
+    if cycles:
+        measured = flight.measured[cycles]
+        starts, durations = [table.starts[k] for k in cycles], [table.durations[k] for k in cycles]
+        truth = ORACLES[name](planner, starts, durations, measured)
+        difference = torch.linalg.vector_norm(flight.commands[cycles] - truth, dim=-1)
+        errors = (difference / torch.linalg.vector_norm(truth, dim=-1)).nan_to_num(nan=float("inf")).tolist()
+        for start, length, state in zip(starts, durations, measured, strict=True):
+            solution = planner.plan(start, state, length).solution
+            residuals.append(float(solution.off_node_residual()))
+            losses.append(float(solution.loss))
+    last = flight.errors[-1].abs().tolist()
+    return GuidanceCertificate(
+        name,
+        cycles,
+        errors,
+        residuals,
+        losses,
+        flight.n_cycles,
+        flight.n_late,
+        float(flight.saturated) if flight.n_cycles else 0.0,
+        {key: value / unit.size for (key, unit), value in zip(plant.states.items(), last, strict=True)},
+        {key: float(values.max()) for key, values in flight.limits().items()} if flight.n_cycles else {},
+        allowed,
+        flight.completed,
+    )
+
+
+def _spread(count: int, wanted: int) -> Sequence[float]:
+    """At most so many of 0 … count − 1, both ends among them."""
+    wanted = min(count, wanted)
+    return [i * (count - 1) / max(wanted - 1, 1) for i in range(wanted)]

@@ -1,0 +1,93 @@
+"""A flight in open formats: flight.json says what was flown, flight.npz and flight.csv hold the numbers."""
+
+from __future__ import annotations
+
+import csv
+import importlib
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from ponn_torch import __version__
+from ponn_torch.guidance.closed_loop import Flight
+from ponn_torch.guidance.tracking import Plant, TrackingProblem
+
+DESCRIPTION, ARRAYS, TABLE = "flight.json", "flight.npz", "flight.csv"
+FORMAT = 1
+PLANTS = "ponn_torch.guidance.plants."
+_FIELDS = ("times", "states", "measured", "commands", "controls", "loss", "passes", "seconds", "late")
+
+
+def make_problem(reference: str, arguments: Mapping[str, Any]) -> TrackingProblem:
+    """Call "module:function" of the package's plants; a name elsewhere is refused, for a file may hold any."""
+    module, _, name = reference.partition(":")
+    if not module.startswith(PLANTS):
+        raise ValueError(f"problem = {reference!r}; allowed: functions of {PLANTS.rstrip('.')}")
+    problem = getattr(importlib.import_module(module), name)(**arguments)
+    if not isinstance(problem, TrackingProblem):
+        raise ValueError(f"problem = {reference!r} makes a {type(problem).__name__}; allowed: a TrackingProblem")
+    return problem
+
+
+def _units(plant: Plant) -> dict[str, float]:
+    components = {**plant.states, **plant.controls}
+    return {"time": plant.time.size} | {name: unit.size for name, unit in components.items()}
+
+
+def save_flight(flight: Flight, folder: Path, *, reference: str, arguments: Mapping[str, Any]) -> None:
+    """Write a flight of the problem that ``reference`` ("module:function") makes of JSON arguments."""
+    folder.mkdir(parents=True, exist_ok=True)
+    plant = flight.problem.plant
+    description = {
+        "format": FORMAT,
+        "version": __version__,
+        "problem": {"reference": reference, "arguments": dict(arguments)},
+        "completed": flight.completed,
+        "units": _units(plant),
+    }
+    (folder / DESCRIPTION).write_text(json.dumps(description, indent=2, ensure_ascii=False) + "\n", encoding="utf-8")
+    with (folder / ARRAYS).open("wb") as stream:
+        np.savez(stream, **{name: getattr(flight, name).numpy() for name in _FIELDS})
+    if flight.states.dim() == 2:
+        _write_table(flight, folder / TABLE)
+
+
+def _write_table(flight: Flight, path: Path) -> None:
+    """One row per cycle in the units that people read."""
+    plant = flight.problem.plant
+    shown = {"t": plant.time} | dict(plant.states) | dict(plant.controls)
+    with path.open("w", newline="", encoding="utf-8") as stream:
+        writer = csv.writer(stream, lineterminator="\n")
+        writer.writerow([f"{name} ({unit.label})" for name, unit in shown.items()])
+        sizes = np.array([unit.size for unit in shown.values()])
+        if flight.n_cycles:
+            rows = torch.cat([flight.times[:-1, None], flight.states[:-1], flight.controls], -1).numpy() / sizes
+            writer.writerows([[format(value, ".12g") for value in row] for row in rows])
+
+
+def load_flight(folder: Path | str) -> Flight:
+    """The flight again, its problem made anew.
+
+    Raises:
+        FileNotFoundError: a missing file.
+        ValueError: another format, a problem outside the package, or one that has changed since.
+    """
+    folder = Path(folder)
+    for name in (DESCRIPTION, ARRAYS):
+        if not (folder / name).is_file():
+            raise FileNotFoundError(f"no flight in {str(folder)!r}: {str(folder / name)!r} does not exist")
+    description = json.loads((folder / DESCRIPTION).read_text(encoding="utf-8"))
+    if description.get("format") != FORMAT:
+        raise ValueError(f"{folder / DESCRIPTION}: format = {description.get('format')!r}; allowed: {FORMAT}")
+    problem = make_problem(description["problem"]["reference"], description["problem"]["arguments"])
+    plant = problem.plant
+    units = _units(plant)
+    with np.load(folder / ARRAYS, allow_pickle=False) as stream:
+        arrays = {name: torch.from_numpy(stream[name]) for name in _FIELDS}
+    if units != description["units"]:
+        raise ValueError(f"{folder / DESCRIPTION}: units = {description['units']}; allowed: {units} of {plant.name}")
+    return Flight(problem, **arrays, completed=bool(description["completed"]))
