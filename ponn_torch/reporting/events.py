@@ -161,6 +161,12 @@ class TensorBoard(Recorder):
         self._writer.close()
 
 
+def _finite(values: Mapping[str, Any]) -> dict[str, float]:
+    """The numbers of nested mappings, as tags."""
+    flat = flatten(values).items()
+    return {name.replace(".", "/"): float(value) for name, value in flat if isinstance(value, bool | int | float)}
+
+
 class Scalars:
     """Numbers of nested mappings under their dotted names, with hyperparameters in the same writer."""
 
@@ -174,7 +180,7 @@ class Scalars:
     def write(self, values: Mapping[str, Any], step: int) -> None:
         """One event for all numbers of a step."""
         self._step = step
-        entries = [Summary.Value(tag=tag, simple_value=value) for tag, value in _numbers(values).items()]
+        entries = [Summary.Value(tag=tag, simple_value=value) for tag, value in _finite(values).items()]
         self._writer._get_file_writer().add_summary(Summary(value=entries), step)
 
     def failed(self, reason: str) -> None:
