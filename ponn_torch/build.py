@@ -75,6 +75,7 @@ class Plan:
     seed: int
     recording: Recording
     threads: int
+    explain: bool
     settings: dict[str, Any]
 
 
@@ -91,7 +92,7 @@ def build(config: DictConfig) -> Plan:
     solver = _solver(node, top)
     recording = call(Recording, _section(node, "record"), "record")
     reject_unknown(node, [key for key in settings if key not in node], "")
-    plan = Plan(top["name"], problem, solver, top["seed"], recording, top["threads"], settings)
+    plan = Plan(top["name"], problem, solver, top["seed"], recording, top["threads"], top["explain"], settings)
     _rehearse(plan)
     return plan
 
@@ -136,7 +137,7 @@ def build_problem(node: Mapping[str, Any]) -> OptimalControlProblem:
 
 
 def _scalars(node: dict[str, Any]) -> dict[str, Any]:
-    kinds: dict[str, Any] = {"name": str, "seed": int, "threads": int, "device": str, "dtype": str}
+    kinds: dict[str, Any] = {"name": str, "seed": int, "threads": int, "explain": bool, "device": str, "dtype": str}
     top = {}
     for key, kind in kinds.items():
         if key not in node:

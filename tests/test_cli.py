@@ -38,7 +38,7 @@ def broken() -> OptimalControlProblem:
     return undefined_name
 """
 LANDING = ["problem=mars_landing", "record=minimal"]
-HOPELESS = [*LANDING, "n_starts=1", "ansatz.size=4", "optimizer.stopping.max_iterations=1"]
+HOPELESS = [*LANDING, "explain=false", "n_starts=1", "ansatz.size=4", "optimizer.stopping.max_iterations=1"]
 
 
 @pytest.fixture

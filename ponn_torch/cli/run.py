@@ -11,6 +11,7 @@ import torch
 from omegaconf import DictConfig
 
 from ponn_torch.build import Plan, build, resolved
+from ponn_torch.cli.explain import explanation
 from ponn_torch.cli.job import DONE, INTERRUPTED, NOT_CERTIFIED, Outcome, run_job
 from ponn_torch.cli.overrides import PONN
 from ponn_torch.cli.session import Tool, sweep_member
@@ -134,7 +135,11 @@ class SolveJob:
             code = DONE  # a smoothed solution was asked for; what it is worth stands in its certificate
         if result.interrupted:
             code = INTERRUPTED
-        return Outcome(code, result.message)
+        message = result.message
+        if code == NOT_CERTIFIED and plan.explain:
+            print("not certified; looking for a reason …", flush=True)
+            message = "; ".join([message, *explanation(plan.problem, plan.solver, plan.seed, result.solution)])
+        return Outcome(code, message)
 
     def completed(self, outcome: Outcome) -> Outcome:
         """The outcome with what the solver told."""

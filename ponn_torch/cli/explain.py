@@ -1,0 +1,64 @@
+"""Why a solve ended without a certificate: evidence from other problems and other methods, or none."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from torch import Tensor
+
+from ponn_torch.baselines.direct import TwoStage, Unstructured
+from ponn_torch.baselines.symbolic import load_casadi
+from ponn_torch.optimal_control.pontryagin import BoundaryValueProblem
+from ponn_torch.optimal_control.problem import OptimalControlProblem
+from ponn_torch.solving.feasibility import check_final_time
+from ponn_torch.solving.guess import Guess, RandomGuess, ScaledCurve
+from ponn_torch.solving.solution import Solution
+from ponn_torch.solving.solver import Solver
+
+N_STARTS, N_SEGMENTS = 4, 100  # of the minimum-time problem; of the direct mesh
+
+
+class _FromSolution:
+    """A failed solution as a first guess of another method."""
+
+    def __init__(self, solution: Solution) -> None:
+        self.solution = solution
+
+    def curve(self, bvp: BoundaryValueProblem, seed: int) -> ScaledCurve:
+        own, curve = self.solution.bvp, self.solution.curve
+        stretch = float(curve.times[-1]) / bvp.final_time
+
+        def at(t: Tensor) -> Tensor:
+            return bvp.to_scaled(*own.to_physical(curve(t * stretch)))
+
+        return at
+
+
+def explanation(problem: OptimalControlProblem, solver: Solver, seed: int, solution: Solution | None) -> list[str]:
+    """Sentences to add to the message of a failed solve; ``solution`` is what it ended with, if anything."""
+    found = check_final_time(problem, replace(solver, n_starts=N_STARTS), seed)
+    if found is not None and found.infeasible:
+        return [found.message]
+    sentences = [] if found is None else [found.message]
+    return [*sentences, *_witness(problem, solver, solution)]
+
+
+def _witness(problem: OptimalControlProblem, solver: Solver, solution: Solution | None) -> list[str]:
+    """What direct collocation says."""
+    try:
+        load_casadi()
+    except ImportError:
+        return []
+    guess: Guess | None = solver.guess
+    if isinstance(guess, RandomGuess):
+        guess = None if solution is None else _FromSolution(solution)
+    try:
+        answer = TwoStage(Unstructured(N_SEGMENTS, guess=guess), n_segments=20).solve(problem)
+    except (TypeError, ValueError) as error:
+        return [f"direct collocation cannot be told of this problem: {error}"]
+    if not answer.solved:
+        return ["direct collocation finds no trajectory either"]
+    unit = problem.display.get("cost")
+    cost = f"{answer.cost / unit.size:.8g} {unit.label}" if unit else f"{answer.cost:.8g}"
+    arcs = f" with arcs {'-'.join(answer.arcs)}" if answer.arcs else ""
+    return [f"direct collocation finds a trajectory{arcs}, {problem.cost_name} {cost}"]
