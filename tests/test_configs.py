@@ -94,6 +94,7 @@ def test_config_holds_every_setting_of_what_it_calls(group: str, option: str) ->
     ("problem", "cost", "free"),
     [
         ("earth_mars", 396.05984393, False),
+        ("earth_venus", 209.42204516, False),
         ("mars_landing", 268.0146563274, False),
         ("mars_landing_g981", 267.9318584923, False),
         ("tfc_test_1", 179.4476468458, True),
@@ -105,8 +106,8 @@ def test_known_optimum_belongs_to_the_published_data(problem: str, cost: float, 
     assert (found.name, found.known_cost) == (problem, cost)
     assert isinstance(found.final_time, FreeTime) is free
     assert built(f"problem={problem}", "problem.regulariser=quadratic").problem.known_cost == cost
-    assert built(f"problem={problem}", "problem.initial_mass=1500").problem.known_cost is None
-    assert built(f"problem={problem}", "problem.initial_mass=1500", "problem.known_cost=3").problem.known_cost == 3
+    assert built(f"problem={problem}", "problem.initial_mass=1600").problem.known_cost is None
+    assert built(f"problem={problem}", "problem.initial_mass=1600", "problem.known_cost=3").problem.known_cost == 3
 
 
 TINY = [

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import torch
 
@@ -16,7 +17,17 @@ from ponn_torch.problems.known import known_optimum
 TIME_UNIT = 58.132 * DAY
 INITIAL_STATE_KM = (-140699693.0, -51614428.0, 980.0, 9.774596, -28.07828, 4.337725e-4)  # km, km/s
 FINAL_STATE_KM = (-172682023.0, 176959469.0, 7948912.0, -16.427384, -14.860506, 9.21486e-2)
-OPTIMA_KG: list[tuple[dict[str, object], float]] = [({}, 396.05984393)]
+EARTH_VENUS: dict[str, Any] = {
+    "initial_position_km": (145234429.92699653, 35542120.35153708, -249.98626982258847),
+    "initial_velocity_km_s": (-7.576177230584825, 28.831342259450356, 4.476600708027599e-4),
+    "final_position_km": (-49025885.07048845, 95580652.67360602, 4137770.8890738026),
+    "final_velocity_km_s": (-31.278624357660835, -16.178908080518262, 1.5837447252559491),
+    "initial_mass": 1500.0,
+    "final_time_days": 1000.0,
+    "maximum_thrust": 0.33,
+    "specific_impulse": 3800.0,
+}
+OPTIMA_KG: list[tuple[dict[str, Any], float]] = [({}, 396.05984393), (EARTH_VENUS, 209.42204516)]
 
 
 def earth_mars(

@@ -10,7 +10,7 @@ import pytest
 import torch
 from helpers import PROBLEMS, PROBLEMS_WITH_ANSWERS, bvp_of, collocation, mass_variables, problem
 
-from ponn_torch.ansatz.basis import Chebyshev
+from ponn_torch.ansatz.basis import Chebyshev, Legendre
 from ponn_torch.optim.base import Status, Stopping
 from ponn_torch.optim.least_squares import LevenbergMarquardt
 from ponn_torch.optimal_control.control_laws import Unconstrained
@@ -18,6 +18,7 @@ from ponn_torch.optimal_control.curve import Curve
 from ponn_torch.optimal_control.pontryagin import pontryagin
 from ponn_torch.optimal_control.problem import OptimalControlProblem
 from ponn_torch.problems.boundary_layer import exact_cost
+from ponn_torch.problems.earth_mars import EARTH_VENUS
 from ponn_torch.solving.certificate import certify
 from ponn_torch.solving.continuation import Adaptive, Ladder, Single
 from ponn_torch.solving.guess import RandomGuess, project
@@ -191,6 +192,22 @@ def test_every_mass_variable_finds_the_optimum(name, mass_variable):
     result = Solver(guess=guess, mass_variable=mass_variable).solve(problem(name))
     assert result.certified, result.message
     assert result.solution.cost == pytest.approx(ANSWERS[name].cost, abs=10 * ANSWERS[name].tolerance)
+
+
+@pytest.mark.slow
+def test_a_transfer_of_many_revolutions_with_eleven_switches_is_certified():
+    solver = Solver(
+        basis=Legendre(14),
+        conditioning="orthonormal",
+        n_nodes=20,
+        n_segments=12,
+        guess=PolarTransfer(revolutions=3),
+        n_starts=1,
+    )
+    result = solver.solve(PROBLEMS["earth_mars"](**EARTH_VENUS))
+    assert result.certified, result.message
+    assert result.solution.cost == pytest.approx(209.42204516, abs=1e-7)
+    assert result.solution.arcs == ["min", "max"] * 6
 
 
 @pytest.mark.slow
