@@ -46,6 +46,8 @@ def gradients_and_values(
             return value.sum(), others
 
         return grad(total, argnums=tuple(range(len(arguments))), has_aux=True)(*arguments)
+    if torch.is_inference_mode_enabled():
+        raise RuntimeError("inside torch.inference_mode every gradient would be zero; use torch.no_grad")
     keep = torch.is_grad_enabled()
     with torch.enable_grad():
         # a view is another node of the graph: what else was computed from the argument is not differentiated

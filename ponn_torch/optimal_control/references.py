@@ -6,6 +6,7 @@ import importlib
 import importlib.util
 import inspect
 import json
+import os
 import pkgutil
 import sys
 from pathlib import Path
@@ -50,6 +51,23 @@ def load_problem(reference: str, **arguments: Any) -> OptimalControlProblem:
     origin = ProblemOrigin(f"{Path(place).resolve()}:{name}" if is_file else reference, arguments)
     object.__setattr__(problem, "origin", origin)  # no constructor argument, so that copies do not inherit it
     return problem
+
+
+def relative_reference(reference: str, folder: Path) -> str:
+    """The reference as a folder can keep it: the way from there to a file, unless only the root is common to both."""
+    place, _, name = reference.rpartition(":")
+    if not place.endswith(".py"):
+        return reference
+    common = Path(os.path.commonpath([Path(place).resolve(), folder.resolve()]))
+    if common == Path(common.anchor):
+        return reference
+    return f"{Path(os.path.relpath(Path(place).resolve(), folder.resolve())).as_posix()}:{name}"
+
+
+def resolved_reference(reference: str, folder: Path) -> str:
+    """Inverse of ``relative_reference``."""
+    place, _, name = reference.rpartition(":")
+    return f"{(folder / place).resolve()}:{name}" if place.endswith(".py") else reference
 
 
 def _module(name: str) -> ModuleType:

@@ -185,7 +185,7 @@ def fly_extremal(solution: Solution, history: list[PiecewiseChebyshev], *, expli
     graph = trace(right_hand_side, t0, y0, codes[0])
 
     def rates(t: float, y: Array, arc: int) -> Array:
-        with torch.inference_mode():
+        with torch.no_grad():  # a function that cannot be traced takes its slopes by autograd
             return graph(t0.new_tensor([t]), torch.from_numpy(y), codes[arc]).numpy()
 
     return fly(rates, arc_knots(solution), y0.numpy(), history, restarts=restarts(solution))

@@ -21,7 +21,7 @@ from ponn_torch.optimal_control.curve import Curve
 from ponn_torch.optimal_control.discretisation import Discretisation, Form, Strong, Weak
 from ponn_torch.optimal_control.pontryagin import Chain, Setting, pontryagin
 from ponn_torch.optimal_control.problem import OptimalControlProblem, nearest
-from ponn_torch.optimal_control.references import load_problem
+from ponn_torch.optimal_control.references import load_problem, relative_reference, resolved_reference
 
 SOLUTION, WEIGHTS = "solution.json", "weights.npz"
 FORMAT = 1
@@ -50,7 +50,7 @@ def save_curve(curve: Curve, folder: Path) -> None:
         "version": __version__,
         "problem": {
             "name": bvp.problem.name,
-            "reference": None if origin is None else origin.reference,
+            "reference": None if origin is None else relative_reference(origin.reference, folder),
             "arguments": None if origin is None else dict(origin.arguments),
         },
         "mass_variable": bvp.mass_variable,
@@ -131,7 +131,7 @@ def _make_problem(saved: dict[str, Any], folder: Path) -> OptimalControlProblem:
             f"{folder / SOLUTION}: problem {saved['name']!r} was not made by load_problem and cannot be "
             "made again; pass it: Solution.load(folder, problem=...)"
         )
-    return load_problem(saved["reference"], **saved["arguments"])
+    return load_problem(resolved_reference(saved["reference"], folder), **saved["arguments"])
 
 
 def _describe_basis(basis: FreeFunction) -> dict[str, Any]:

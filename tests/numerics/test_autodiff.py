@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pytest
 import torch
 from torch import Tensor
 from torch.func import grad, jacrev, vmap
@@ -91,3 +92,9 @@ def test_row_gradients_are_the_rows_of_the_jacobian_for_every_member_of_a_batch(
     expected = vmap(jacrev(rows, argnums=(0, 1)))(x, y)
     torch.testing.assert_close(by_x.movedim(0, -2), expected[0])
     torch.testing.assert_close(by_y.movedim(0, -2), expected[1])
+
+
+def test_inference_mode_which_would_make_gradients_zero_is_refused():
+    x, y = sample()
+    with torch.inference_mode(), pytest.raises(RuntimeError, match=r"use torch\.no_grad"):
+        gradients(energy, x, y)

@@ -293,6 +293,21 @@ def test_arguments_are_kept_as_json_gives_them_back():
     json.dumps(dict(problem.origin.arguments))
 
 
+def test_a_problem_in_a_file_is_saved_by_the_way_to_it(tmp_path):
+    """A folder that is moved together with the file still finds it."""
+    here = tmp_path / "here"
+    (here / "runs" / "one").mkdir(parents=True)
+    source = Path(__file__).with_name("analytic.py").read_text(encoding="utf-8")
+    (here / "mine.py").write_text(source, encoding="utf-8")
+    problem = load_problem(f"{here / 'mine.py'}:minimum_energy", distance=2.0)
+    solve(problem, REST).save(here / "runs" / "one")
+    saved = (here / "runs" / "one" / "solution.json").read_text(encoding="utf-8")
+    assert json.loads(saved)["problem"]["reference"] == "../../mine.py:minimum_energy"
+    assert str(tmp_path) not in saved
+    here.rename(tmp_path / "there")
+    assert Solution.load(tmp_path / "there" / "runs" / "one").problem.known_cost == 24.0
+
+
 def test_a_changed_copy_loses_its_origin():
     problem = load_problem("ponn_torch.problems.mars_landing:mars_landing")
     assert problem.origin is not None
