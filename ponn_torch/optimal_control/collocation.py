@@ -249,14 +249,23 @@ class Collocation:
             arcs = regime.arcs.unsqueeze(-2).expand(*shape, regime.arcs.shape[-1]).reshape(-1, regime.arcs.shape[-1])
         return Setting(Regime(smoothing, arcs), {k: spread(v) for k, v in self.setting.parameters.items()})
 
+    def stretch(self, h: Tensor) -> Tensor:
+        """Half lengths (..., K) relative to those of the first guess."""
+        return 2 * h / (self.known_times[..., 1:] - self.known_times[..., :-1])
+
     def equations(self, jets: Sequence[Tensor], h: Tensor, rates: Tensor) -> Tensor:
-        """Rows (..., K, n_rows): test functions applied to y^(q) − h^q F."""
+        """Rows (..., K, n_rows): test functions applied to (y^(q) − h^q F) (h₀/h)^(q−1), h₀ the first guess of h.
+
+        Without the last factor a segment that shrinks to nothing would let y^(q−1) jump at no residual, as if by a free
+        impulse.
+        """
         rows = []
         for group, jet in zip(self.discretisation.groups, jets, strict=True):
             pointwise = jet[..., -1, :]
             if not group.trivial:
                 scale = h[..., None] ** group.order * group.factors[:, -1]
                 pointwise = pointwise - scale[..., None] * rates[..., group.columns[:, -1]].mT
+            pointwise = pointwise / self.stretch(h)[..., None, None] ** (group.order - 1)
             rows.append((pointwise @ group.test.mT).flatten(-2))
         return torch.cat(rows, -1)
 

@@ -38,8 +38,17 @@ def linearise(collocation: Collocation, xi: Tensor) -> tuple[Tensor, ArrowJacobi
         by_h = _by_half_length(collocation, jets, kappas, h, rates, by_t, by_w)
         _by_times(collocation, by_h, h, by_t, shared)
 
+    equations = collocation.equations(jets, h, rates)
+    for group in disc.groups:
+        power = group.order - 1
+        if power:
+            weight = collocation.stretch(h)[..., None, None] ** -power
+            local[..., group.rows, :] *= weight
+            shared[..., group.rows, :] *= weight
+            by_weight = (0.5 * power * (g - f)) * equations[..., group.rows, None] / h[..., None, None]
+            shared[..., group.rows, -2:] += torch.cat([by_weight, -by_weight], -1)
     extra_rows, extra = collocation.extra_linearised(unknowns)
-    residual = torch.cat([collocation.equations(jets, h, rates).flatten(-2), extra_rows], -1)
+    residual = torch.cat([equations.flatten(-2), extra_rows], -1)
     return residual, ArrowJacobian(local, shared, extra, collocation.shared_index)
 
 
