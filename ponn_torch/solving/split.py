@@ -8,6 +8,7 @@ these are tried: a solved residual with the wrong arcs is an extremal of nothing
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -21,62 +22,96 @@ from ponn_torch.optimal_control.curve import Curve
 from ponn_torch.optimal_control.discretisation import Discretisation
 from ponn_torch.optimal_control.pontryagin import Setting
 from ponn_torch.solving.refinement import MakeCallback, Outcome, Refined, Segmentation, Segments
-from ponn_torch.solving.switching import Structure, find_structure, without_short_arcs
+from ponn_torch.solving.sharpening import graded_times
+from ponn_torch.solving.switching import Structure, claimed_structure, find_structure, needles, without_short_arcs
+
+LEGIBLE = 1e-4  # ‖r‖ of a sharpened curve whose arcs are worth reading
+SAME_SWITCH = 1e-6  # scaled times that differ by less are those of one switch
+MORE_SEGMENTS = 4  # multiples of n_segments that are tried where there is no smoothing to lower
 
 
 @dataclass(frozen=True)
 class Split(Segmentation):
     """Solve between switches until arcs and S agree and the equations hold between the nodes.
 
-    Every arc is one or more segments; those that subdivide it sit at fixed fractions between its switches. Arcs are
-    added where S asks for them and merged away where a failed round made them collapse. When this does not end, the
-    smoothed curve was too blunt to show the structure: it is sharpened, and the split starts anew on more segments.
+    Every arc is one or more segments; those that subdivide it sit at fixed fractions between its switches. Where S asks
+    for other arcs one is added, as a needle that the next round widens; arcs that a failed round made collapse are
+    merged away. When this does not end, the smoothed curve was too blunt to show the structure: it is sharpened step by
+    step on graded segments, and a structure that was not read before is split anew.
 
     Attributes:
         max_arcs: more arcs than this are taken for a sign of a singular arc.
+        needle: longest duration of a new arc, as a fraction of the final time.
         short_arc: arcs shorter than this fraction of the final time in a failed round are merged away.
+        sign_tolerance: depth of S on the wrong side of zero that is still round-off.
         max_sharpenings, sharpening: how often, and by which factor, the smoothing is lowered after a failure.
     """
 
     reads_arcs: ClassVar[bool] = True
     max_arcs: int = 40
+    needle: float = 0.01
     short_arc: float = 1e-4
-    max_sharpenings: int = 4
-    sharpening: float = 0.3
+    sign_tolerance: float = 1e-10
+    max_sharpenings: int = 10
+    sharpening: float = 0.5
 
     def run(self, start: Curve, callback: MakeCallback | None = None) -> Refined:
-        disc, smoothed = self.discretisation(start.collocation.bvp), start
-        rounds: list[OptimizeResult] = []
-        refined = self._split(disc, smoothed, self.n_segments, rounds, callback)
-        for attempt in range(2, self.max_sharpenings + 2):
+        disc, rounds = self.discretisation(start.collocation.bvp), list[OptimizeResult]()
+        read: list[tuple[Structure, int]] = []
+        refined = Refined(start, Outcome.STRUCTURE, rounds)
+        for smoothed, n_segments in self._starts(disc, start, rounds, callback):
+            if rounds and rounds[-1].status.cut:
+                return Refined(smoothed, Outcome.INTERRUPTED, rounds)
+            structure = find_structure(smoothed)
+            if any(structure.same_arcs(other) and n_segments == n for other, n in read):
+                continue
+            read.append((structure, n_segments))
+            refined = self._split(disc, smoothed, structure, n_segments, rounds, callback)
             if refined.outcome in (Outcome.SOLVED, Outcome.INTERRUPTED):
                 break
-            smoothing = smoothed.collocation.setting.regime.smoothing
-            if smoothing is not None:
-                sharper = self.sharpening * smoothing
-                smoothed, result = self._sharpened(disc, smoothed, sharper, attempt * self.n_segments, callback)
-                rounds.append(result)
-                if result.status.cut:
-                    return Refined(smoothed, Outcome.INTERRUPTED, rounds)
-            refined = self._split(disc, smoothed, attempt * self.n_segments, rounds, callback)
         return refined
+
+    def _starts(
+        self, disc: Discretisation, start: Curve, rounds: list[OptimizeResult], callback: MakeCallback | None
+    ) -> Iterator[tuple[Curve, int]]:
+        """Curves to read the arcs from, and numbers of segments: ever sharper ones, or where none is smoothed, more."""
+        yield start, self.n_segments
+        smoothing, factor = start.collocation.setting.regime.smoothing, self.sharpening
+        for attempt in range(self.max_sharpenings):
+            if smoothing is None:
+                if attempt < MORE_SEGMENTS:
+                    yield start, (attempt + 2) * self.n_segments
+                continue
+            sharper = factor * smoothing
+            times = graded_times(start, float(sharper), self.n_segments)
+            collocation = Collocation.on_segments(disc, times, setting=start.collocation.setting)
+            curve, result = self.solve(collocation.with_setting(smoothing=sharper), start, callback)
+            rounds.append(result)
+            if result.status.cut or float(result.norm) < LEGIBLE:
+                start, smoothing = curve, sharper
+                yield start, self.n_segments
+            else:
+                factor = factor**0.5
 
     def _split(
         self,
         disc: Discretisation,
-        start: Curve,
+        curve: Curve,
+        structure: Structure,
         n_segments: int,
         rounds: list[OptimizeResult],
         callback: MakeCallback | None,
     ) -> Refined:
-        """Rounds of solving, repairing the arcs and halving segments, from one smoothed curve."""
-        bvp, parameters = disc.bvp, start.collocation.setting.parameters
-        curve, outcome = start, Outcome.STRUCTURE
-        structure = find_structure(start)
-        segments = _spread(structure, start.times, n_segments)
-        tried: list[Structure] = []
+        """Rounds from one curve: depth first through the arcs that S asks for; kept is the last curve that is solved."""
+        bvp, parameters = disc.bvp, curve.collocation.setting.parameters
+        pending = [(curve, _spread(structure, curve.times, n_segments))]
+        seen: list[Structure] = []
+        outcome = Outcome.STRUCTURE
         for _ in range(self.max_rounds):
-            if len(structure) > self.max_arcs:
+            if not pending:
+                break
+            before, segments = pending.pop()
+            if len(segments.events) - segments.events.count(None) >= self.max_arcs:
                 return Refined(curve, Outcome.TOO_MANY_ARCS, rounds)
             if len(segments.arcs) > self.max_segments:
                 return Refined(curve, Outcome.TOO_MANY_SEGMENTS, rounds)
@@ -84,49 +119,30 @@ class Split(Segmentation):
             collocation = Collocation.on_segments(
                 disc, segments.times, events=segments.events, setting=Setting(regime, parameters)
             )
-            solution, result = self.solve(collocation, curve, callback)
+            solution, result = self.solve(collocation, before, callback)
             rounds.append(result)
             if result.status.cut:
                 return Refined(solution, Outcome.INTERRUPTED, rounds)
+            found = claimed_structure(solution)
             if not self.solved(result):
-                ends = solution.times[[0, *collocation.switch_knots, -1]]
-                repaired = without_short_arcs(structure, ends, self.short_arc)
-                if any(repaired.same_arcs(other) for other in [structure, *tried]):
-                    return Refined(solution, Outcome.RESIDUAL, rounds)
-                tried.append(structure)
-                curve, structure, outcome = solution, repaired, Outcome.RESIDUAL
-                segments = _spread(structure, solution.times, n_segments)
+                outcome = Outcome.RESIDUAL
+                ends = torch.cat([solution.times[:1], found.times, solution.times[-1:]])
+                asked = [without_short_arcs(found, ends, self.short_arc)]
+            elif any(found.near(other, SAME_SWITCH) for other in seen):
                 continue
-            if _collapsed(solution):
-                return Refined(solution, Outcome.STRUCTURE, rounds)
-            curve, found = solution, find_structure(solution)
-            if not found.same_arcs(structure):
-                if any(found.same_arcs(other) for other in tried):
-                    return Refined(curve, Outcome.STRUCTURE, rounds)  # going round in circles
-                tried.append(structure)
-                outcome, structure = Outcome.STRUCTURE, found
-                segments = _spread(found, solution.times, n_segments)
-                continue
-            coarse = self.coarse(solution)
-            if not bool(coarse.any()):
-                return Refined(curve, Outcome.SOLVED, rounds)
-            outcome = Outcome.COARSE
-            segments = Segments(solution.times, segments.events, segments.arcs).halved(coarse)
+            else:
+                curve, outcome, asked = solution, Outcome.STRUCTURE, needles(solution, self.needle, self.sign_tolerance)
+                if not asked:
+                    coarse = self.coarse(solution)
+                    if not bool(coarse.any()):
+                        return Refined(solution, Outcome.SOLVED, rounds)
+                    outcome = Outcome.COARSE
+                    pending.append((solution, Segments(solution.times, segments.events, segments.arcs).halved(coarse)))
+                    continue
+            seen.append(found)
+            asked = [other for other in asked if not any(other.near(one, SAME_SWITCH) for one in seen)]
+            pending += [(curve, _spread(other, curve.times, n_segments)) for other in reversed(asked)]
         return Refined(curve, outcome, rounds)
-
-    def _sharpened(
-        self, disc: Discretisation, curve: Curve, smoothing: Tensor, n_segments: int, callback: MakeCallback | None
-    ) -> tuple[Curve, OptimizeResult]:
-        """The smoothed problem at a lower smoothing."""
-        share = torch.linspace(0, 1, n_segments + 1, dtype=curve.xi.dtype, device=curve.xi.device)
-        collocation = Collocation.on_segments(disc, share * curve.times[-1], setting=curve.collocation.setting)
-        return self.solve(collocation.with_setting(smoothing=smoothing), curve, callback)
-
-
-def _collapsed(curve: Curve, fraction: float = 1e-7) -> bool:
-    """Whether some arc was solved away to nothing: the wrong arcs, though the residual vanishes."""
-    durations = curve.times[1:] - curve.times[:-1]
-    return float(durations.min()) < fraction * float(curve.times[-1] - curve.times[0])
 
 
 def _spread(structure: Structure, times: Tensor, n_segments: int) -> Segments:

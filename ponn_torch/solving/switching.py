@@ -8,7 +8,7 @@ from itertools import pairwise
 import torch
 from torch import Tensor
 
-from ponn_torch.optimal_control.control_laws import Regime
+from ponn_torch.optimal_control.control_laws import INTERIOR, LOWER, UPPER, Regime
 from ponn_torch.optimal_control.curve import Curve
 from ponn_torch.optimal_control.pontryagin import Setting
 
@@ -26,6 +26,18 @@ class Structure:
 
     def same_arcs(self, other: Structure) -> bool:
         return self.arcs.shape == other.arcs.shape and bool((self.arcs == other.arcs).all())
+
+    def near(self, other: Structure, tolerance: float) -> bool:
+        """The same arcs, and switch times that differ by no more than this."""
+        return self.same_arcs(other) and bool(((self.times - other.times).abs() <= tolerance).all())
+
+
+def claimed_structure(curve: Curve) -> Structure:
+    """The arcs that a split curve was solved on, whatever its S says; one arc without a code where it was not split."""
+    collocation = curve.collocation
+    switches, arcs = collocation.switch_knots, collocation.setting.regime.arcs
+    codes = curve.times.new_zeros(1, 0).long() if arcs is None else arcs[[0, *switches]]
+    return Structure(codes, curve.times[switches], tuple(e for e in collocation.events if e is not None))
 
 
 def switching_along(curve: Curve, t: Tensor, w: Tensor | None = None) -> Tensor:
@@ -87,3 +99,68 @@ def without_short_arcs(structure: Structure, knot_times: Tensor, fraction: float
         arcs.append(structure.arcs[after])
     merged = torch.stack(times) if times else structure.times[:0]
     return Structure(torch.stack(arcs), merged, tuple(events))
+
+
+# -- repair ------------------------------------------------------------------------------------------------------------
+
+
+def wrong_side(switching: Tensor, codes: Tensor) -> Tensor:
+    """How far every S (m, n_switching) lies on the side that its arc's codes (m, k) exclude; negative where it does not.
+
+    A convex H has one S at each bound: the control is off the lower bound where the first is positive, and at the upper
+    where the second is.
+    """
+    affine = switching.shape[-1] == codes.shape[-1]
+    claimed = codes == UPPER if affine else torch.cat([codes >= INTERIOR, codes >= UPPER], -1)
+    return torch.where(claimed, -switching, switching)
+
+
+def needles(curve: Curve, width: float, tolerance: float) -> list[Structure]:
+    """The structures of a split ``curve`` with one short arc more where S is on the wrong side; the deepest first.
+
+    On the wrong arcs S is that of another extremal, and its zeros say little about the right ones. But its sign is the
+    first-order effect of a needle variation on the cost, so that a needle leads downhill: two switches about the peak of
+    S, or one where S asks to change an end. ``width`` is its longest duration as a fraction of the final time.
+    """
+    collocation, claimed = curve.collocation, claimed_structure(curve)
+    if collocation.setting.regime.arcs is None:
+        return []
+    arcs, events = claimed.arcs, claimed.events
+    ends = torch.cat([curve.times[:1], claimed.times, curve.times[-1:]])
+    n_points = max(100, 1000 // collocation.n_segments)
+    t, w = grid(curve, n_points)
+    starts = torch.tensor(collocation.switch_knots, dtype=torch.long)
+    of_segment = torch.bucketize(torch.arange(collocation.n_segments), starts, right=True)
+    arc = of_segment.repeat_interleave(n_points).to(t.device)
+    depth = wrong_side(switching_along(curve, t, w), arcs[arc])
+    found: list[tuple[float, Structure]] = []
+    for event, column in enumerate(depth.unbind(-1)):
+        # runs of points on the wrong side, cut where an arc ends
+        run = torch.where(column > tolerance, arc + 1, 0)
+        cuts = (run.diff() != 0).nonzero()[:, 0] + 1
+        for points in torch.arange(len(run), device=run.device).tensor_split(cuts.cpu()):
+            if not int(run[points[0]]):
+                continue
+            k, peak = int(arc[points[0]]), int(points[column[points].argmax()])
+            length = min(width * float(ends[-1] - ends[0]), 0.3 * float(ends[k + 1] - ends[k]))
+            middle = float(t[peak].clamp(ends[k] + length, ends[k + 1] - length))
+            new, needle = [middle - 0.5 * length, middle + 0.5 * length], _other_side(arcs[k], event, depth.shape[-1])
+            pieces = [arcs[: k + 1], needle[None], arcs[k:]]
+            if int(points[-1]) == len(run) - 1:
+                new, pieces = [float(ends[-1]) - length], pieces[:2]
+            elif int(points[0]) == 0:
+                new, pieces = [float(ends[0]) + length], pieces[1:]
+            switches = torch.cat([ends[1 : k + 1], ends.new_tensor(new), ends[k + 1 : -1]])
+            structure = Structure(torch.cat(pieces), switches, (*events[:k], *[event] * len(new), *events[k:]))
+            found.append((float(column[peak]), structure))
+    return [structure for _, structure in sorted(found, key=lambda pair: -pair[0])]
+
+
+def _other_side(codes: Tensor, event: int, n_switching: int) -> Tensor:
+    """Arc codes (k,) with the component of one switching function moved to that function's other side."""
+    levels = (LOWER, UPPER) if n_switching == len(codes) else (LOWER, INTERIOR, UPPER)
+    component, level = event % len(codes), event // len(codes)
+    low, high = levels[level], levels[level + 1]
+    changed = codes.clone()
+    changed[component] = low if int(codes[component]) >= high else high
+    return changed

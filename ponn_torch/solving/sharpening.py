@@ -1,0 +1,51 @@
+"""Sharpening: the smoothed problem at smaller smoothing, on segments graded towards its switches.
+
+The structure of the optimum shows in S only where S is well above ρ: what touches zero, or an arc of a day at an end,
+is hidden until ρ is small. A single polynomial does not follow the control there; segments do, if they are placed
+right.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from ponn_torch.optimal_control.curve import Curve
+from ponn_torch.solving.switching import grid, switching_along
+
+RESOLUTION = 2.0  # change of asinh(2S/πρ) along one segment
+
+
+def graded_times(curve: Curve, smoothing: float, n_segments: int) -> Tensor:
+    """Scaled knot times (K+1,) on which S of this curve is resolved at ``smoothing``; K is n_segments and more.
+
+    tanh(S/ρ) has its poles where S = ±iπρ/2. To first order that is at a distance of √(S² + (πρ/2)²)/|S'| from t, and
+    polynomials converge on segments that are short against it. The number of segments per time that this asks for is
+    the rate of change of asinh(2S/πρ): the knots are spread evenly over its variation and the time together, so that
+    halving ρ adds ln 2 / 2 ≈ 0.7 segments for every switch.
+    """
+    t, w = grid(curve, max(50, 2000 // curve.collocation.n_segments))
+    variation = torch.asinh(2 * switching_along(curve, t, w) / (math.pi * smoothing)).diff(dim=0).abs().sum(-1)
+    density = variation / RESOLUTION + n_segments * t.diff() / (t[-1] - t[0])
+    total = torch.cat([density.new_zeros(1), density.cumsum(0)])
+    count = math.ceil(float(total[-1]))
+    levels = total[-1] * torch.arange(1, count, dtype=t.dtype, device=t.device) / count
+    i = torch.searchsorted(total, levels).clamp(1, len(t) - 1)
+    inner = t[i - 1] + (levels - total[i - 1]) / (total[i] - total[i - 1]) * (t[i] - t[i - 1])
+    return torch.cat([t[:1], inner, t[-1:]])
+
+
+def undecided(curve: Curve, smoothing: float) -> tuple[float, float]:
+    """The longest interval of scaled time over which some |S| ≤ ρ; (0, 0) if there is none."""
+    t, w = grid(curve, max(50, 2000 // curve.collocation.n_segments))
+    best = (0.0, 0.0)
+    for inside in (switching_along(curve, t, w).abs() <= smoothing).unbind(-1):
+        edges = torch.cat([inside.new_zeros(1), inside, inside.new_zeros(1)]).long().diff()
+        firsts, lasts = (edges == 1).nonzero()[:, 0], (edges == -1).nonzero()[:, 0] - 1
+        if len(firsts):
+            longest = int((t[lasts] - t[firsts]).argmax())
+            found = (float(t[firsts[longest]]), float(t[lasts[longest]]))
+            best = max(best, found, key=lambda ends: ends[1] - ends[0])
+    return best
