@@ -39,17 +39,24 @@ def linearise(collocation: Collocation, xi: Tensor) -> tuple[Tensor, ArrowJacobi
         _by_times(collocation, by_h, h, by_t, shared)
 
     equations = collocation.equations(jets, h, rates)
-    for group in disc.groups:
-        power = group.order - 1
-        if power:
-            weight = collocation.stretch(h)[..., None, None] ** -power
-            local[..., group.rows, :] *= weight
-            shared[..., group.rows, :] *= weight
-            by_weight = (0.5 * power * (g - f)) * equations[..., group.rows, None] / h[..., None, None]
-            shared[..., group.rows, -2:] += torch.cat([by_weight, -by_weight], -1)
+    _weigh(collocation, equations, h, local, shared)
     extra_rows, extra = collocation.extra_linearised(unknowns)
     residual = torch.cat([equations.flatten(-2), extra_rows], -1)
     return residual, ArrowJacobian(local, shared, extra, collocation.shared_index)
+
+
+def _weigh(collocation: Collocation, equations: Tensor, h: Tensor, local: Tensor, shared: Tensor) -> None:
+    """Give the rows of ``local`` and ``shared`` the factor (h₀/h)^(q−1) of the equations (..., K, n_rows)."""
+    f, g = (fraction[:, None, None] for fraction in collocation.end_fractions)
+    stretch, length = collocation.stretch(h)[..., None, None], h[..., None, None]
+    for group in collocation.discretisation.groups:
+        power = group.order - 1
+        if power and len(collocation.free_times):
+            local[..., group.rows, :] /= stretch**power
+            shared[..., group.rows, :] /= stretch**power
+            # 2h is the distance between the anchors times g − f
+            by_end = -0.5 * power * (g - f) * equations[..., group.rows, None] / length
+            shared[..., group.rows, -2:] += torch.cat([-by_end, by_end], -1)
 
 
 def _rates_and_slopes(collocation: Collocation, t: Tensor, w: Tensor) -> tuple[Tensor, Tensor, Tensor]:

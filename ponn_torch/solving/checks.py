@@ -10,10 +10,11 @@ import torch
 from torch import Tensor
 
 from ponn_torch.numerics.autodiff import gradients
-from ponn_torch.optimal_control.control_laws import INTERIOR, UPPER, Regime
+from ponn_torch.optimal_control.control_laws import INTERIOR, Regime
 from ponn_torch.optimal_control.pontryagin import Setting
 from ponn_torch.solving.flight import Flight, arc_knots
 from ponn_torch.solving.solution import Solution
+from ponn_torch.solving.switching import wrong_side
 
 
 def _last(solution: Solution, flight: Flight) -> tuple[Tensor, Tensor, Setting]:
@@ -137,18 +138,6 @@ def hamiltonian_drift(solution: Solution, flight: Flight, explicit_time: bool) -
 # -- signs of the switching functions ------------------------------------------------------------------------
 
 
-def _depth(switching: Tensor, codes: Tensor) -> Tensor:
-    """Distance (m, k) of S from the side that the codes claim, negative where it is on it.
-
-    A convex H has one S at each bound: the control is off the lower bound where the first is positive, and at
-    the upper where the second is.
-    """
-    levels = (UPPER,) if switching.shape[-1] == codes.shape[-1] else (INTERIOR, UPPER)
-    parts = switching.chunk(len(levels), -1)
-    signed = [torch.where(codes >= level, -s, s) for level, s in zip(levels, parts, strict=True)]
-    return torch.stack(signed).amax(0)
-
-
 def signs(solution: Solution, tolerance: float, n_points: int = 401) -> tuple[float | None, float | None]:
     """(deepest S on the wrong side, largest share of an arc with S = 0), refined at ends and peaks."""
     curve = solution.curve
@@ -172,7 +161,7 @@ def signs(solution: Solution, tolerance: float, n_points: int = 401) -> tuple[fl
 
         z = grid
         for _ in range(3):
-            depth = _depth(switching(z), codes)
+            depth = wrong_side(switching(z), codes)
             deepest = max(deepest, _worst(depth.clamp_min(0.0)))
             # a local maximum between grid points may reach further: look there again, closer
             rise = (depth[1:-1] >= depth[:-2]) & (depth[1:-1] >= depth[2:])

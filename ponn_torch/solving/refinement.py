@@ -38,16 +38,22 @@ class Outcome(Enum):
     COARSE = "the residual between the nodes stayed above its tolerance"
     TOO_MANY_ARCS = "S asks for more arcs than allowed: a singular arc, or a curve that is no solution"
     TOO_MANY_SEGMENTS = "more segments were needed than allowed"
+    SINGULAR = "a switching function vanishes over an interval, so that the optimum has a singular arc there"
     INTERRUPTED = "interrupted, from the keyboard or by the budget"
 
 
 @dataclass(frozen=True)
 class Refined:
-    """The last curve, how the refinement ended, and every round's optimiser result."""
+    """The last curve, how the refinement ended, every round's optimiser result, and what more there is to say."""
 
     curve: Curve
     outcome: Outcome
     rounds: list[OptimizeResult]
+    note: str = ""
+
+    @property
+    def message(self) -> str:
+        return self.outcome.value + self.note
 
 
 class Refinement(Protocol):

@@ -323,7 +323,7 @@ class _Run:
         self.observer.stage_started(name, None, len(self.stages))
         refined = refinement.run(smoothed.curve, self._callback)
         if not refined.rounds:
-            return smoothed, refined.outcome.value
+            return smoothed, refined.message
         for result in refined.rounds[:-1]:
             self._stage(name, None, result, float("nan"), float("nan"), None)
         solution = self._record(name, refined.curve, refined.rounds[-1])
@@ -331,7 +331,7 @@ class _Run:
             raise _Interrupted
         if refined.outcome is refinements.Outcome.SOLVED:
             return solution, ""
-        return smoothed, f"{name}: {refined.outcome.value}"
+        return smoothed, f"{name}: {refined.message}"
 
     # -- bookkeeping -------------------------------------------------------------------------------------------------
 

@@ -21,10 +21,12 @@ from ponn_torch.optimal_control.control_laws import Regime
 from ponn_torch.optimal_control.curve import Curve
 from ponn_torch.optimal_control.discretisation import Discretisation
 from ponn_torch.optimal_control.pontryagin import Setting
+from ponn_torch.optimal_control.problem import DisplayUnit
 from ponn_torch.solving.refinement import MakeCallback, Outcome, Refined, Segmentation, Segments
-from ponn_torch.solving.sharpening import graded_times
+from ponn_torch.solving.sharpening import graded_times, singular_interval, undecided
 from ponn_torch.solving.switching import Structure, claimed_structure, find_structure, needles, without_short_arcs
 
+COLLAPSED = 1e-7  # fraction of the final time, below which an arc is solved away to nothing
 LEGIBLE = 1e-4  # ‖r‖ of a sharpened curve whose arcs are worth reading
 SAME_SWITCH = 1e-6  # scaled times that differ by less are those of one switch
 MORE_SEGMENTS = 4  # multiples of n_segments that are tried where there is no smoothing to lower
@@ -58,18 +60,27 @@ class Split(Segmentation):
     def run(self, start: Curve, callback: MakeCallback | None = None) -> Refined:
         disc, rounds = self.discretisation(start.collocation.bvp), list[OptimizeResult]()
         read: list[tuple[Structure, int]] = []
+        rungs: list[tuple[float, tuple[float, float]]] = []
         refined = Refined(start, Outcome.STRUCTURE, rounds)
         for smoothed, n_segments in self._starts(disc, start, rounds, callback):
             if rounds and rounds[-1].status.cut:
                 return Refined(smoothed, Outcome.INTERRUPTED, rounds)
+            smoothing = smoothed.collocation.setting.regime.smoothing
+            if smoothing is not None:
+                rungs.append((float(smoothing), undecided(smoothed, float(smoothing))))
             structure = find_structure(smoothed)
             if any(structure.same_arcs(other) and n_segments == n for other, n in read):
                 continue
             read.append((structure, n_segments))
             refined = self._split(disc, smoothed, structure, n_segments, rounds, callback)
             if refined.outcome in (Outcome.SOLVED, Outcome.INTERRUPTED):
-                break
-        return refined
+                return refined
+        singular = singular_interval(rungs)
+        if singular is None:
+            return refined
+        unit = start.collocation.bvp.problem.display.get("time", DisplayUnit("s"))
+        ends = [f"{time * start.collocation.bvp.time_unit / unit.size:.4g}" for time in singular]
+        return Refined(smoothed, Outcome.SINGULAR, rounds, f": from {ends[0]} to {ends[1]} {unit.label}")
 
     def _starts(
         self, disc: Discretisation, start: Curve, rounds: list[OptimizeResult], callback: MakeCallback | None
@@ -102,7 +113,7 @@ class Split(Segmentation):
         rounds: list[OptimizeResult],
         callback: MakeCallback | None,
     ) -> Refined:
-        """Rounds from one curve: depth first through the arcs that S asks for; kept is the last curve that is solved."""
+        """Rounds from one curve, depth first through the repairs of its arcs; the last curve that is solved is kept."""
         bvp, parameters = disc.bvp, curve.collocation.setting.parameters
         pending = [(curve, _spread(structure, curve.times, n_segments))]
         seen: list[Structure] = []
@@ -123,26 +134,33 @@ class Split(Segmentation):
             rounds.append(result)
             if result.status.cut:
                 return Refined(solution, Outcome.INTERRUPTED, rounds)
-            found = claimed_structure(solution)
-            if not self.solved(result):
-                outcome = Outcome.RESIDUAL
-                ends = torch.cat([solution.times[:1], found.times, solution.times[-1:]])
-                asked = [without_short_arcs(found, ends, self.short_arc)]
-            elif any(found.near(other, SAME_SWITCH) for other in seen):
+            solved, found = self.solved(result), claimed_structure(solution)
+            if solved and any(found.near(other, SAME_SWITCH) for other in seen):
                 continue
+            repairs = self._repairs(solution, solved)
+            if not solved:
+                outcome = Outcome.RESIDUAL
+            elif repairs:
+                curve, outcome = solution, Outcome.STRUCTURE
             else:
-                curve, outcome, asked = solution, Outcome.STRUCTURE, needles(solution, self.needle, self.sign_tolerance)
-                if not asked:
-                    coarse = self.coarse(solution)
-                    if not bool(coarse.any()):
-                        return Refined(solution, Outcome.SOLVED, rounds)
-                    outcome = Outcome.COARSE
-                    pending.append((solution, Segments(solution.times, segments.events, segments.arcs).halved(coarse)))
-                    continue
+                curve, outcome, coarse = solution, Outcome.COARSE, self.coarse(solution)
+                if not bool(coarse.any()):
+                    return Refined(curve, Outcome.SOLVED, rounds)
+                pending.append((curve, Segments(curve.times, segments.events, segments.arcs).halved(coarse)))
+                continue
             seen.append(found)
-            asked = [other for other in asked if not any(other.near(one, SAME_SWITCH) for one in seen)]
-            pending += [(curve, _spread(other, curve.times, n_segments)) for other in reversed(asked)]
+            repairs = [other for other in repairs if not any(other.near(one, SAME_SWITCH) for one in seen)]
+            pending += [(curve, _spread(other, curve.times, n_segments)) for other in reversed(repairs)]
         return Refined(curve, outcome, rounds)
+
+    def _repairs(self, curve: Curve, solved: bool) -> list[Structure]:
+        """Other structures to try, the best first: without the arcs that are gone, or one needle more where S asks."""
+        found = claimed_structure(curve)
+        ends = torch.cat([curve.times[:1], found.times, curve.times[-1:]])
+        merged = without_short_arcs(found, ends, COLLAPSED if solved else self.short_arc)
+        if len(merged) < len(found):
+            return [merged]
+        return needles(curve, self.needle, self.sign_tolerance) if solved else []
 
 
 def _spread(structure: Structure, times: Tensor, n_segments: int) -> Segments:

@@ -105,7 +105,7 @@ def without_short_arcs(structure: Structure, knot_times: Tensor, fraction: float
 
 
 def wrong_side(switching: Tensor, codes: Tensor) -> Tensor:
-    """How far every S (m, n_switching) lies on the side that its arc's codes (m, k) exclude; negative where it does not.
+    """How far every S (m, n_switching) is on the side that its arc's codes (m, k) exclude; negative on the right one.
 
     A convex H has one S at each bound: the control is off the lower bound where the first is positive, and at the upper
     where the second is.
@@ -119,8 +119,8 @@ def needles(curve: Curve, width: float, tolerance: float) -> list[Structure]:
     """The structures of a split ``curve`` with one short arc more where S is on the wrong side; the deepest first.
 
     On the wrong arcs S is that of another extremal, and its zeros say little about the right ones. But its sign is the
-    first-order effect of a needle variation on the cost, so that a needle leads downhill: two switches about the peak of
-    S, or one where S asks to change an end. ``width`` is its longest duration as a fraction of the final time.
+    first-order effect of a needle variation on the cost, so that a needle leads downhill: two switches about the peak
+    of S, or one where S asks to change an end. ``width`` is its longest duration as a fraction of the final time.
     """
     collocation, claimed = curve.collocation, claimed_structure(curve)
     if collocation.setting.regime.arcs is None:
@@ -144,15 +144,16 @@ def needles(curve: Curve, width: float, tolerance: float) -> list[Structure]:
             k, peak = int(arc[points[0]]), int(points[column[points].argmax()])
             length = min(width * float(ends[-1] - ends[0]), 0.3 * float(ends[k + 1] - ends[k]))
             middle = float(t[peak].clamp(ends[k] + length, ends[k + 1] - length))
-            new, needle = [middle - 0.5 * length, middle + 0.5 * length], _other_side(arcs[k], event, depth.shape[-1])
+            new = [middle - 0.5 * length, middle + 0.5 * length]
+            needle = _other_side(arcs[k], event, depth.shape[-1])
             pieces = [arcs[: k + 1], needle[None], arcs[k:]]
             if int(points[-1]) == len(run) - 1:
                 new, pieces = [float(ends[-1]) - length], pieces[:2]
             elif int(points[0]) == 0:
                 new, pieces = [float(ends[0]) + length], pieces[1:]
             switches = torch.cat([ends[1 : k + 1], ends.new_tensor(new), ends[k + 1 : -1]])
-            structure = Structure(torch.cat(pieces), switches, (*events[:k], *[event] * len(new), *events[k:]))
-            found.append((float(column[peak]), structure))
+            what = (*events[:k], *[event] * len(new), *events[k:])
+            found.append((float(column[peak]), Structure(torch.cat(pieces), switches, what)))
     return [structure for _, structure in sorted(found, key=lambda pair: -pair[0])]
 
 

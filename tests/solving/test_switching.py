@@ -20,7 +20,15 @@ from ponn_torch.optimal_control.discretisation import Discretisation
 from ponn_torch.optimal_control.pontryagin import pontryagin
 from ponn_torch.optimal_control.problem import OptimalControlProblem
 from ponn_torch.solving.guess import project
-from ponn_torch.solving.switching import Structure, find_structure, switching_along, without_short_arcs
+from ponn_torch.solving.switching import (
+    Structure,
+    claimed_structure,
+    find_structure,
+    needles,
+    switching_along,
+    without_short_arcs,
+    wrong_side,
+)
 
 PUSH = 1.5 - math.sqrt(1.25)  # of the minimum-fuel double integrator over 3 s
 SLOPE = 2 / (3 - 2 * PUSH)
@@ -177,3 +185,57 @@ def test_when_all_are_short_the_longest_stays():
     times = torch.tensor([0.0, 0.2, 0.5, 0.7, 1.0], dtype=torch.float64)
     merged = without_short_arcs(structure_of([2, 0, 2, 0], [0.2, 0.5, 0.7]), times, 0.9)
     assert len(merged) == 1
+
+
+# -- needles -------------------------------------------------------------------------------------------------
+
+
+def claiming(code: int, costate: Callable[[Tensor], Tensor]) -> Curve:
+    """``with_costate`` said to be one arc."""
+    curve = with_costate(costate)
+    made = replace(
+        curve.collocation, setting=replace(curve.collocation.setting, regime=Regime(arcs=torch.tensor([[code]])))
+    )
+    return Curve(made, curve.xi)
+
+
+def test_an_extremal_asks_for_no_needle():
+    curve = Curve(*exact_split())
+    assert claimed_structure(curve).times.tolist() == pytest.approx([PUSH, 3 - PUSH])
+    assert claimed_structure(curve).arcs.flatten().tolist() == [UPPER, LOWER, UPPER]
+    assert needles(curve, 0.01, 1e-10) == []
+
+
+def test_a_needle_at_an_end_is_one_new_switch():
+    # S = SLOPE |t − 1.5| − 1 on a coast: positive at both ends, a little more at the last
+    asked = needles(claiming(LOWER, lambda t: (SLOPE + 0.01) * (t - 1.5) + 1e-3), 0.01, 1e-10)
+    assert [structure.arcs.flatten().tolist() for structure in asked] == [[LOWER, UPPER], [UPPER, LOWER]]
+    assert asked[0].times.tolist() == pytest.approx([2.97])
+    assert asked[1].times.tolist() == pytest.approx([0.03])
+    assert asked[0].events == (0,)
+
+
+def test_a_needle_inside_sits_where_s_is_deepest_and_the_deepest_comes_first():
+    def costate(t: Tensor) -> Tensor:
+        return 1.5 - 0.7 * torch.exp(-20 * (t - 0.8) ** 2) - 0.8 * torch.exp(-20 * (t - 2.0) ** 2)
+
+    asked = needles(claiming(UPPER, costate), 0.02, 1e-10)
+    assert [structure.arcs.flatten().tolist() for structure in asked] == [[UPPER, LOWER, UPPER]] * 2
+    assert asked[0].times.tolist() == pytest.approx([1.97, 2.03], abs=2e-3)
+    assert asked[1].times.tolist() == pytest.approx([0.77, 0.83], abs=2e-3)
+    assert asked[0].events == (0, 0)
+
+
+@pytest.mark.parametrize(("depth", "count"), [(-1e-6, 0), (0.0, 0), (1e-6, 1)])
+def test_a_tangency_asks_for_a_needle_only_when_it_crosses(depth, count):
+    # a push whose S touches zero at 1.2, or falls short of it, or crosses
+    asked = needles(claiming(UPPER, lambda t: 1.0 + 0.2 * (t - 1.2) ** 2 - depth), 0.01, 1e-10)
+    assert len(asked) == count
+
+
+def test_the_wrong_side_of_a_convex_component_is_told_at_both_bounds():
+    # S at the lower and at the upper bound: below both, between, above both
+    switching = torch.tensor([[-1.0, -3.0], [1.0, -1.0], [3.0, 1.0]])
+    for row, code in enumerate((LOWER, INTERIOR, UPPER)):
+        worst = [float(wrong_side(switching, torch.full((3, 1), c)).amax(-1)[row]) for c in (LOWER, INTERIOR, UPPER)]
+        assert [value <= 0 for value in worst] == [c == code for c in (LOWER, INTERIOR, UPPER)]

@@ -1,0 +1,108 @@
+"""Sharper curves show the structure, on segments that resolve them; a singular arc is recognised and said."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from itertools import pairwise
+
+import numpy as np
+import pytest
+import torch
+from helpers import collocation
+from torch import Tensor
+
+from ponn_torch.optimal_control.control_laws import Box
+from ponn_torch.optimal_control.curve import Curve
+from ponn_torch.optimal_control.pontryagin import pontryagin
+from ponn_torch.optimal_control.problem import OptimalControlProblem
+from ponn_torch.solving.guess import project
+from ponn_torch.solving.sharpening import graded_times, singular_interval, undecided
+from ponn_torch.solving.solver import Solver
+from ponn_torch.solving.split import Split
+from ponn_torch.solving.switching import switching_along
+
+
+def regulator(**final: float) -> OptimalControlProblem:
+    """min ½∫x² dt with ẋ = u, |u| ≤ 1, x(0) = 1: full speed to zero, then u = 0, which is singular."""
+    return OptimalControlProblem(
+        name="regulator",
+        states={"x": 1},
+        control=Box("u", 1.0, -1.0),
+        dynamics=lambda t, x, u, p: {"x": u.u},
+        running_cost=lambda t, x, u, p: 0.5 * (x.x**2).sum(-1, keepdim=True),
+        initial={"x": 1.0},
+        final=final,
+        final_time=3.0,
+    )
+
+
+def with_switching(s: Callable[[Tensor], Tensor]) -> Curve:
+    """A curve of the regulator whose S is a given function of time."""
+    made = collocation(pontryagin(regulator(x=0.0), chains=False), n_neurons=40, n_nodes=60)
+    one = torch.ones(1, dtype=torch.float64)
+    unit = switching_along(Curve(made, project(made, lambda t: torch.stack([0 * t, 0 * t + 1], -1))), one)
+    return Curve(made, project(made, lambda t: torch.stack([0 * t, s(t) / unit[0, 0]], -1)))
+
+
+def crossing(t: Tensor) -> Tensor:
+    return torch.sin(2.0 * t - 1.0)
+
+
+def test_halving_the_smoothing_adds_few_segments():
+    """ln 2 / RESOLUTION of the variation of asinh on both sides of every one of the two switches."""
+    curve = with_switching(crossing)
+    counts = [len(graded_times(curve, 2.0**-k, 8)) for k in range(4, 14)]
+    assert counts == sorted(counts)
+    assert (counts[-1] - counts[0]) / 9 == pytest.approx(2 * math.log(2), rel=0.2)
+
+
+@pytest.mark.parametrize("smoothing", [1e-1, 1e-2, 1e-3])
+def test_graded_segments_resolve_the_smoothed_control(smoothing):
+    curve = with_switching(crossing)
+    times = graded_times(curve, smoothing, 8)
+    assert bool((times.diff() > 0).all())
+    assert times[[0, -1]].tolist() == curve.times.tolist()
+
+    def error(knots: np.ndarray) -> float:
+        worst = 0.0
+        for start, end in pairwise(knots):
+            grid = np.linspace(start, end, 101)
+            fit = np.polynomial.Chebyshev.interpolate(
+                lambda t: np.tanh(np.sin(2 * t - 1) / smoothing), 13, (start, end)
+            )
+            worst = max(worst, np.abs(fit(grid) - np.tanh(np.sin(2 * grid - 1) / smoothing)).max())
+        return worst
+
+    graded = error(times.numpy())
+    assert graded < 1e-3
+    if smoothing <= 1e-2:
+        assert graded < 0.05 * error(np.linspace(0.0, 3.0, len(times)))
+
+
+def test_the_undecided_interval_is_the_longest_with_s_below_the_smoothing():
+    start, end = undecided(with_switching(lambda t: (t - 1.0) * (t - 2.5) ** 2), 0.1)
+    inside = [t for t in np.linspace(2.0, 3.0, 100001) if abs((t - 1.0) * (t - 2.5) ** 2) <= 0.1]
+    assert (start, end) == pytest.approx((inside[0], inside[-1]), abs=3e-3)
+    assert undecided(with_switching(lambda t: 1.0 + t), 0.1) == (0.0, 0.0)
+
+
+@pytest.mark.parametrize(("power", "singular"), [(1.0, False), (0.5, False), (0.0, True)])
+def test_an_interval_that_does_not_shrink_is_singular(power, singular):
+    """Widths fall as ρ about a switch and as √ρ where S touches zero."""
+    rungs = [(rho, (1.0, 1.0 + 0.5 * rho**power)) for rho in (0.1, 0.05, 0.025, 0.0125, 0.00625)]
+    found = singular_interval(rungs)
+    assert (found == rungs[-1][1]) if singular else (found is None)
+    assert singular_interval(rungs[:2]) is None  # too few to tell
+    assert singular_interval([]) is None
+
+
+@pytest.mark.parametrize(("final", "until"), [({}, 3.0), ({"x": 0.5}, 2.5)])
+def test_a_singular_arc_is_said_and_never_certified_as_bang_bang(final, until):
+    solver = Solver(n_starts=1, refinement=Split(max_rounds=2, max_sharpenings=6))
+    result = solver.solve(regulator(**final), 0)
+    assert "singular arc" in result.message
+    named = [float(word) for word in result.message.split() if word[0].isdigit()]
+    assert named == pytest.approx([1.0, until], abs=0.05)
+    assert result.solution is not None
+    assert result.solution.kind == "smoothed"
