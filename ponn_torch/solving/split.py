@@ -8,6 +8,7 @@ these are tried: a solved residual with the wrong arcs is an extremal of nothing
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import ClassVar
@@ -115,13 +116,13 @@ class Split(Segmentation):
     ) -> Refined:
         """Rounds from one curve, depth first through the repairs of its arcs; the last curve that is solved is kept."""
         bvp, parameters = disc.bvp, curve.collocation.setting.parameters
-        pending = [(curve, _spread(structure, curve.times, n_segments))]
+        pending = [(curve, _spread(structure, curve.times, n_segments), math.inf)]
         seen: list[Structure] = []
         outcome = Outcome.STRUCTURE
         for _ in range(self.max_rounds):
             if not pending:
                 break
-            before, segments = pending.pop()
+            before, segments, norm = pending.pop()
             if len(segments.events) - segments.events.count(None) >= self.max_arcs:
                 return Refined(curve, Outcome.TOO_MANY_ARCS, rounds)
             if len(segments.arcs) > self.max_segments:
@@ -137,20 +138,24 @@ class Split(Segmentation):
             solved, found = self.solved(result), claimed_structure(solution)
             if solved and any(found.near(other, SAME_SWITCH) for other in seen):
                 continue
-            repairs = self._repairs(solution, solved)
+            repairs, coarse = self._repairs(solution, solved), self.coarse(solution)
             if not solved:
                 outcome = Outcome.RESIDUAL
             elif repairs:
                 curve, outcome = solution, Outcome.STRUCTURE
             else:
-                curve, outcome, coarse = solution, Outcome.COARSE, self.coarse(solution)
+                curve, outcome = solution, Outcome.COARSE
                 if not bool(coarse.any()):
                     return Refined(curve, Outcome.SOLVED, rounds)
-                pending.append((curve, Segments(curve.times, segments.events, segments.arcs).halved(coarse)))
+            legible = float(result.norm) < min(LEGIBLE, 0.1 * norm)
+            if not repairs and bool(coarse.any()) and (solved or legible):
+                # also where nothing but the resolution keeps the residual up, as long as that helps
+                halved = Segments(solution.times, segments.events, segments.arcs).halved(coarse)
+                pending.append((solution, halved, float(result.norm)))
                 continue
             seen.append(found)
             repairs = [other for other in repairs if not any(other.near(one, SAME_SWITCH) for one in seen)]
-            pending += [(curve, _spread(other, curve.times, n_segments)) for other in reversed(repairs)]
+            pending += [(curve, _spread(other, curve.times, n_segments), math.inf) for other in reversed(repairs)]
         return Refined(curve, outcome, rounds)
 
     def _repairs(self, curve: Curve, solved: bool) -> list[Structure]:
