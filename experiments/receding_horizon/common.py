@@ -6,7 +6,6 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-import torch
 from torch import Tensor
 
 from ponn_torch.ansatz.basis import Chebyshev
@@ -48,7 +47,9 @@ class Watched(HorizonController):
         return decision
 
 
-def flown(problem: TrackingProblem, solver: HorizonSolver, passes: Passes, ending: str) -> tuple[Flight, Watched, float]:
+def flown(
+    problem: TrackingProblem, solver: HorizonSolver, passes: Passes, ending: str
+) -> tuple[Flight, Watched, float]:
     """A flight, its plans, CPU seconds without the trace of derivatives."""
     planner = Planner(problem, solver, passes, traced=True)
     planner.plan(0.0, problem.initial)
@@ -58,8 +59,11 @@ def flown(problem: TrackingProblem, solver: HorizonSolver, passes: Passes, endin
     return flight, controller, time.process_time() - began
 
 
-def median_seconds(call: Callable[[], object], count: int = 300) -> float:
-    """CPU time of a call, median of many after a few to warm up."""
+def seconds_of(call: Callable[[], object], count: int = 300) -> tuple[float, float]:
+    """CPU time of a call: median and first decile of many, after a few to warm up.
+
+    On a shared machine other processes take the caches too, which the decile feels less.
+    """
     for _ in range(10):
         call()
     spent = []
@@ -67,4 +71,5 @@ def median_seconds(call: Callable[[], object], count: int = 300) -> float:
         began = time.process_time()
         call()
         spent.append(time.process_time() - began)
-    return float(torch.tensor(spent).median())
+    spent.sort()
+    return spent[count // 2], spent[count // 10]

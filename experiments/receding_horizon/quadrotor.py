@@ -75,7 +75,9 @@ def run_costs() -> Report:
             plan = Planner(problem, chebyshev(), Passes(40, 1e-10, second)).plan(0.0, problem.initial)
             measured[f"costs/{x:g} {name} passes to 1e-10"] = float(plan.passes)
             changes = " ".join(f"{float(change):.0e}" for change in plan.changes)
-            rows.append({"Δx m": x, "horizons by": f"{name}, first horizon to 1e-10: {plan.passes} passes", "u0": changes})
+            rows.append(
+                {"Δx m": x, "horizons by": f"{name}, first horizon to 1e-10: {plan.passes} passes", "u0": changes}
+            )
     return Report({"costs": rows}, markdown(rows), measured)
 
 

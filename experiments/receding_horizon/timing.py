@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 
-from experiments.receding_horizon.common import chebyshev, median_seconds
+from experiments.receding_horizon.common import chebyshev, seconds_of
 from experiments.tables import Report, markdown
 from ponn_torch.guidance.elimination import ROUTES
 from ponn_torch.guidance.expansion import expand
@@ -33,25 +33,27 @@ def run() -> Report:
             for route in ROUTES:
                 solver = chebyshev(n_nodes, route)
                 given = _given(problem, Planner(problem, solver))
-                times[route] = median_seconds(lambda: solver.solve(given), count)  # noqa: B023
+                times[route] = seconds_of(lambda: solver.solve(given), count)  # noqa: B023
             solver = chebyshev(n_nodes)
             planner = Planner(problem, solver, Passes(1), traced=True)
             given = _given(problem, planner)
             factored = solver.factor(given)
             affine, vehicle = factored.affine(), problem.initial[None]
-            times["cached LU"] = median_seconds(lambda: factored.solve(given), count)  # noqa: B023
-            times["cached gain, all coefficients"] = median_seconds(lambda: affine.coefficients(vehicle), count)  # noqa: B023
-            times["expansion and LU (a cycle)"] = median_seconds(lambda: planner.plan(0.0, problem.initial), count)  # noqa: B023
-            row = {"horizon": name} | {f"{key}, ms": f"{1e3 * value:.3f}" for key, value in times.items()}
-            row |= {"paper, ms": theirs, "paper / LU": f"{theirs / (1e3 * times['lu']):.1f}"}
+            times["cached LU"] = seconds_of(lambda: factored.solve(given), count)  # noqa: B023
+            times["cached gain, all coefficients"] = seconds_of(lambda: affine.coefficients(vehicle), count)  # noqa: B023
+            times["expansion and LU (a cycle)"] = seconds_of(lambda: planner.plan(0.0, problem.initial), count)  # noqa: B023
+            row = {"horizon": name}
+            row |= {f"{key}, ms": f"{1e3 * middle:.3f} ({1e3 * low:.3f})" for key, (middle, low) in times.items()}
+            row |= {"paper, ms": theirs, "paper / LU": f"{theirs / (1e3 * times['lu'][0]):.1f}"}
             rows.append(row)
-            measured |= {f"timing/{name} {key} ms": 1e3 * value for key, value in times.items()}
+            measured |= {f"timing/{name} {key} ms": 1e3 * middle for key, (middle, _) in times.items()}
+            measured |= {f"timing/{name} {key} ms, first decile": 1e3 * low for key, (_, low) in times.items()}
             if n_nodes == 10 and problem.plant.linear:
                 vehicles = problem.initial + 1e-3 * torch.rand(BATCH, 6, dtype=torch.float64)
-                seconds = median_seconds(lambda: affine.coefficients(vehicles), 20)  # noqa: B023
+                seconds, _ = seconds_of(lambda: affine.coefficients(vehicles), 20)  # noqa: B023
                 measured["timing/schedule, all coefficients, solves per second"] = BATCH / seconds
                 matrix, offset = affine.values(planner.points[:1])
-                first = median_seconds(lambda: vehicles @ matrix[0].mT + offset[0], 20)  # noqa: B023
+                first, _ = seconds_of(lambda: vehicles @ matrix[0].mT + offset[0], 20)  # noqa: B023
                 measured["timing/schedule, first values only, solves per second"] = BATCH / first
     batch = [
         {"batch of 10 000": key.partition(", ")[2], "per second": f"{value:.3g}"}

@@ -27,6 +27,7 @@ from ponn_torch.reporting.flights import FlightRecorder
 from ponn_torch.settings import ConfigError, arguments_of, call, fit, located, reject_unknown, target, value_of
 
 FLIGHT, DISPERSED = "flight", "monte_carlo"
+WORTH_TRACING = 50  # cycles; the trace of derivatives takes about as long as it saves in so many
 GROUPS = ("problem", "method", "passes", "loop", "record")
 PLANTS = ("ponn_torch.guidance.plants",)
 
@@ -198,11 +199,11 @@ class FlightJob:
 
     def _work(self, plan: FlightPlan, recorder: FlightRecorder) -> Outcome:
         problem, solver = plan.problem, plan.method.solver(plan.problem, plan.seed)
-        planner = Planner(problem, solver, plan.passes, traced=True)
+        planner = Planner(problem, solver, plan.passes, traced=len(plan.table.starts) >= WORTH_TRACING)
         controller: Controller = HorizonController(planner, plan.table)
         if plan.schedule:
             controller = gain_schedule(planner, plan.table)
-        else:  # derivatives are traced now: no decision should wait for that
+        elif planner.traced:  # now: no decision should wait for that
             planner.plan(plan.table.starts[0], problem.initial, plan.table.durations[0])
         self.flight = fly(
             problem,

@@ -149,6 +149,8 @@ class HorizonSolver:
             given = (problem.drift.expand(*shape, *problem.drift.shape[-2:]), ends.expand(*shape, *ends.shape[-2:]))
             return torch.cat([part.flatten(-2) for part in given], dim=-1)
         known = self._known(problem)
+        if known.dim() == 1:
+            return (problem.drift + problem.matrix @ known).flatten(-2)
         return (problem.drift + (problem.matrix @ known[..., None, :, None]).squeeze(-1)).flatten(-2)
 
     def _known(self, problem: LinearTPBVP) -> Tensor:
