@@ -86,7 +86,7 @@ class Segmentation:
     off_node_tolerance: float = 1e-9
     stopping: Stopping = field(
         default_factory=lambda: Stopping(
-            tolerance=1e-13, decrease=1e-2, patience=2, max_iterations=80, hopeless=1e-3, hopeless_after=30
+            tolerance=1e-14, decrease=1e-2, patience=2, max_iterations=80, hopeless=1e-3, hopeless_after=30
         )
     )
     damping: float = 1e-8
