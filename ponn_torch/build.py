@@ -189,6 +189,8 @@ def _solver(node: dict[str, Any], top: Mapping[str, Any]) -> Solver:
     budget = _section(node, "budget")
     fields["cpu_seconds"] = budget.pop("cpu_seconds", math.inf)
     reject_unknown(budget, ["cpu_seconds"], "budget")
+    data = _section(node, "data")
+    fields["data"] = value_of(data, hints["data"], "data") if data else None
     refinement = _section(node, "refinement")
     fields["refinement"] = value_of(refinement, hints["refinement"], "refinement") if refinement else None
     for key in (
@@ -215,5 +217,7 @@ def _rehearse(plan: Plan) -> None:
     try:
         _ = solver.discretisation(bvp).groups
         solver.guess.curve(bvp, 1000 * plan.seed)
+        if solver.data is not None:
+            solver.data.of(plan.problem)
     except ValueError as error:
         raise ConfigError(located(error, "", [*types_of(Solver), "kind"])) from error

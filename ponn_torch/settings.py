@@ -20,6 +20,7 @@ ROOMS = (
     "ponn_torch.ansatz.basis",
     "ponn_torch.ansatz.networks",
     "ponn_torch.optimal_control.discretisation",
+    "ponn_torch.optimal_control.measurements",
     "ponn_torch.optim",
     "ponn_torch.solving",
     "ponn_torch.guidance",
@@ -32,6 +33,7 @@ PLACES = {
     "kind": "nodes.kind",
     "n_nodes": "nodes.n_nodes",
     "cpu_seconds": "budget.cpu_seconds",
+    "path": "data.path",
 }
 KINDS = {float: "a number", int: "an integer", bool: "true or false", str: "text", NoneType: "null"}
 

@@ -232,6 +232,41 @@ def events_in_progress(records: Path) -> int:
     return records.read_text(encoding="utf-8").count('"event": "stage"')
 
 
+@pytest.mark.parametrize("optimizer", ["lm", "lbfgs"])
+def test_a_resumed_run_ends_as_the_uninterrupted_one(optimizer: str, tmp_path: Path) -> None:
+    sizes = ["ansatz.size=12", "nodes.n_nodes=20", "optimizer.stopping.max_iterations=25", "start_limit=100"]
+    common = [*LANDING, *sizes, f"optimizer={optimizer}", "refinement=none", "continuation.values=[1.0,0.5]"]
+    whole, cut = tmp_path / "whole", tmp_path / "cut"
+    assert main([*common, f"hydra.run.dir='{whole}'"]) == 0
+    assert main([*common, "budget.cpu_seconds=0.1", f"hydra.run.dir='{cut}'"]) in (0, 2)
+    assert list((cut / "checkpoints").glob("*.npz"))
+    assert not (whole / "checkpoints").exists()
+    short = iterations_in(cut)
+    assert main([f"resume={cut}", "budget.cpu_seconds=.inf"]) == 0
+    assert not (cut / "checkpoints").exists()
+    assert iterations_in(cut) == iterations_in(whole)
+    assert iterations_in(cut)[: len(short)] == short
+    assert 0 < len(short) < len(iterations_in(whole))
+    found, expected = (Solution.load(folder / "solution").curve.xi.tolist() for folder in (cut, whole))
+    assert found == expected  # bit for bit
+
+
+def iterations_in(folder: Path) -> list[dict[str, object]]:
+    lines = (folder / "records.jsonl").read_text(encoding="utf-8").splitlines()
+    records = [json.loads(line) for line in lines]
+    return [{k: v for k, v in record.items() if k != "seconds"} for record in records if record["event"] == "iteration"]
+
+
+def test_a_resume_that_finds_nothing_is_an_error(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    for arguments, told in (
+        ([f"resume={tmp_path}"], "nothing to resume"),
+        (["-m", f"resume={tmp_path}"], "allowed: alone"),
+    ):
+        assert main(arguments) == 1
+        (line,) = capsys.readouterr().err.splitlines()
+        assert told in line
+
+
 # -- sweeps and texts ------------------------------------------------------------------------------
 
 

@@ -25,8 +25,13 @@ OPTIONS = sorted((path.parent.name, path.stem) for path in CONFIGS.glob("*/*.yam
 REFERENCE = "problem.reference='ponn_torch.problems.mars_landing:mars_landing'"
 
 
+DATA = Path(__file__).parent / "landing.csv"
+# What a config cannot do without.
+NEEDED = {"custom": [REFERENCE], "file": [f"data.path='{DATA}'", "problem=mars_landing"]}
+
+
 def overrides_of(group: str, option: str) -> list[str]:
-    return [f"{group}={option}", *([REFERENCE] if option == "custom" else [])]
+    return [f"{group}={option}", *NEEDED.get(option, [])]
 
 
 def composed(overrides: list[str]) -> DictConfig:
@@ -139,7 +144,7 @@ INSTEAD = {
     "two_loop": ["refinement.max_rounds=1", "refinement.stopping.max_iterations=2"],
     "split_mlp": ["refinement.max_rounds=1", "refinement.max_sharpenings=0", "refinement.stopping.max_iterations=2"],
     "subdivide": ["refinement.max_rounds=1", "refinement.stopping.max_iterations=2"],
-    "custom": [REFERENCE],
+    **NEEDED,
     "adam_lbfgs": [f"optimizer.parts.{i}.stopping.max_iterations=2" for i in (0, 1)],
     "adam_lm": [f"optimizer.parts.{i}.stopping.max_iterations=2" for i in (0, 1)],
     "lm_output": [

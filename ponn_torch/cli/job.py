@@ -28,7 +28,7 @@ from ponn_torch.reporting.report import (
 from ponn_torch.settings import ConfigError, one_line
 
 DONE, BAD_INPUT, NOT_CERTIFIED, BUG, INTERRUPTED = 0, 1, 2, 3, 130
-CONFIG, OVERRIDES = "config.yaml", "overrides.yaml"
+CONFIG, OVERRIDES, CHECKPOINTS = "config.yaml", "overrides.yaml", "checkpoints"
 FILES = (CONFIG, OVERRIDES, OUTCOME, RECORDS, REPORT, ENVIRONMENT, CERTIFICATE, FAILURE, FAILURE_TEXT)
 
 
@@ -73,10 +73,10 @@ class Job(Protocol):
         """What a person wants to see at the end."""
 
 
-def run_job(job: Job, folder: Path, overrides: Sequence[str]) -> Outcome:
-    """Leave a complete folder; raises for nothing that happens in between."""
+def run_job(job: Job, folder: Path, overrides: Sequence[str], *, resume: bool = False) -> Outcome:
+    """Leave a complete folder; raises for nothing that happens in between. ``resume`` keeps its checkpoints."""
     folder.mkdir(parents=True, exist_ok=True)
-    _clear(folder)
+    _clear(folder, (SOLUTION, FIGURES) if resume else (SOLUTION, FIGURES, CHECKPOINTS))
     began = time.process_time()
     error: BaseException | None = None
     try:
@@ -112,7 +112,7 @@ def _surviving(folder: Path, outcome: Outcome, keep: Callable[[], None]) -> Outc
     return outcome
 
 
-def _clear(folder: Path) -> None:
+def _clear(folder: Path, below: Sequence[str]) -> None:
     """Remove what an earlier run left here, and nothing else."""
     if not (folder / OUTCOME).exists() and not (folder / RECORDS).exists():
         return
@@ -120,7 +120,7 @@ def _clear(folder: Path) -> None:
         (folder / name).unlink(missing_ok=True)
     for events in folder.glob("events.out.tfevents.*"):
         events.unlink()
-    for name in (SOLUTION, FIGURES):
+    for name in below:
         shutil.rmtree(folder / name, ignore_errors=True)
 
 

@@ -25,16 +25,17 @@ VALUES = ("job", "hydra", "all", "config", "defaults", "defaults-tree", "plugins
 class Application:
     """A command: its name, its main config, the folder of its groups below the configs.
 
-    own_problem: whether ``problem=file.py:function`` is understood.
+    own_problem: whether ``problem=file.py:function`` is understood. resumable: whether ``resume=FOLDER`` is.
     """
 
     program: str
     config: str
     folder: str = "."
     own_problem: bool = False
+    resumable: bool = False
 
 
-PONN = Application("ponn", "solve", own_problem=True)
+PONN = Application("ponn", "solve", own_problem=True, resumable=True)
 RHC = Application("ponn-rhc", "track", "rhc")
 APPLICATIONS = {application.program: application for application in (PONN, RHC)}
 
@@ -45,11 +46,12 @@ class InputError(ValueError):
 
 @dataclass(frozen=True)
 class Command:
-    """Hydra's options, overrides, and the config of a single run (None for a sweep, or for an inspection)."""
+    """Hydra's options, overrides, the config of a single run (None for a sweep, or an inspection), a folder to resume."""
 
     options: list[str]
     overrides: list[str]
     config: DictConfig | None
+    resume: Path | None = None
 
     @property
     def multirun(self) -> bool:
@@ -93,6 +95,9 @@ def read(arguments: Sequence[str], application: Application = PONN) -> Command:
         InputError: an unknown option, a setting that does not exist, a value that no config is named after.
     """
     options, overrides = _split(arguments)
+    folders = [text.partition("=")[2].strip("'\"") for text in overrides if text.startswith("resume=")]
+    if folders and application.resumable:
+        return _resumed(Path(folders[0]), options, [text for text in overrides if not text.startswith("resume=")])
     if application.own_problem:
         overrides = [part for text in overrides for part in _own_problem(text)]
     command = Command(options, overrides, None)
@@ -101,6 +106,24 @@ def read(arguments: Sequence[str], application: Application = PONN) -> Command:
     if command.multirun:
         _check(overrides, application)
     return command
+
+
+def _resumed(folder: Path, options: Sequence[str], overrides: Sequence[str]) -> Command:
+    """The command that goes on with a run: its own config, changed where overrides say so."""
+    if options:
+        raise InputError(f"resume = {str(folder)!r} with {' '.join(options)}; allowed: alone, or with KEY=VALUE")
+    saved = folder / "config.yaml"
+    if not saved.is_file() or not any((folder / "checkpoints").glob("*.npz")):
+        raise InputError(
+            f"resume = {str(folder)!r}: nothing to resume; allowed: the folder of a run that was cut short"
+        )
+    config = OmegaConf.load(saved)
+    assert isinstance(config, DictConfig)
+    for text in overrides:
+        key, _, value = text.partition("=")
+        _check_key(config, key, [])
+        OmegaConf.update(config, key, OmegaConf.from_dotlist([f"value={value}"]).value)
+    return Command([], list(overrides), config, folder)
 
 
 def composed(overrides: Sequence[str], with_hydra: bool = False, application: Application = PONN) -> DictConfig:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -12,17 +13,18 @@ from omegaconf import DictConfig
 
 from ponn_torch.build import Plan, build, resolved
 from ponn_torch.cli.explain import explanation
-from ponn_torch.cli.job import DONE, INTERRUPTED, NOT_CERTIFIED, Outcome, run_job
+from ponn_torch.cli.job import CHECKPOINTS, DONE, INTERRUPTED, NOT_CERTIFIED, Outcome, run_job
 from ponn_torch.cli.overrides import PONN
 from ponn_torch.cli.session import Tool, sweep_member
 from ponn_torch.optimal_control.problem import DisplayUnit
 from ponn_torch.reporting.members import BESIDES, SOLUTION
 from ponn_torch.reporting.recorder import Recorder
-from ponn_torch.reporting.records import RunRecorder
+from ponn_torch.reporting.records import RECORDS, RunRecorder, recorded
 from ponn_torch.reporting.reference import Reference
 from ponn_torch.reporting.report import write_report
 from ponn_torch.settings import ConfigError, one_line
 from ponn_torch.solving.certificate import Certificate
+from ponn_torch.solving.journal import Journal
 from ponn_torch.solving.observer import StageResult
 from ponn_torch.solving.solution import Solution
 
@@ -65,6 +67,12 @@ def run(
     return run_job(SolveJob(config, folder, overrides, plan, choices or {}), folder, overrides)
 
 
+def resume(config: DictConfig, folder: Path, overrides: Sequence[str]) -> Outcome:
+    """Go on with the run in a folder from its checkpoints; it ends as the uninterrupted run would have."""
+    job = SolveJob(config, folder, overrides, None, {}, resume=True)
+    return run_job(job, folder, overrides, resume=True)
+
+
 def _told_apart(plan: Plan, overrides: Sequence[str], choices: Mapping[str, Any]) -> dict[str, Any]:
     """The few settings that tell runs apart: what was chosen and what was changed, for TensorBoard's HPARAMS."""
     given = (text.partition("=") for text in overrides)
@@ -100,11 +108,20 @@ class SolveJob:
     """Solves an optimal control problem."""
 
     def __init__(
-        self, config: DictConfig, folder: Path, overrides: Sequence[str], plan: Plan | None, choices: Mapping[str, Any]
+        self,
+        config: DictConfig,
+        folder: Path,
+        overrides: Sequence[str],
+        plan: Plan | None,
+        choices: Mapping[str, Any],
+        *,
+        resume: bool = False,
     ) -> None:
         self._config, self._folder, self._plan = config, folder, plan
         self._overrides, self._choices = overrides, choices
-        self._keeper = _Keeper()
+        self._keeper, self._resume = _Keeper(), resume
+        # before the folder is cleared
+        self._replay = recorded(folder / RECORDS) if resume else {}
 
     def prepare(self) -> Mapping[str, Any]:
         if self._plan is None or resolved(self._config) != self._plan.settings:
@@ -126,10 +143,12 @@ class SolveJob:
             cost_every=recording.cost_every,
             figures=recording.stage_figures,
             reference=_reference(plan),
+            replay=self._replay,
             extra=(self._keeper,),
         )
+        journal = Journal(self._folder / CHECKPOINTS, resume=self._resume)
         with recorder:
-            result = plan.solver.solve(plan.problem, plan.seed, recorder)
+            result = plan.solver.solve(plan.problem, plan.seed, recorder, journal)
         code = DONE if result.certified else NOT_CERTIFIED
         if plan.solver.refinement is None and result.solution is not None and result.certificate is not None:
             code = DONE  # a smoothed solution was asked for; what it is worth stands in its certificate
@@ -161,6 +180,8 @@ class SolveJob:
     def keep(self, outcome: Outcome) -> None:
         """Save the best solution and write the report; the figures last, for they are most likely to fail."""
         plan, best = self._plan, self._keeper.best
+        if outcome.exit_code in (DONE, NOT_CERTIFIED) and not any(stage.status.cut for stage in self._keeper.stages):
+            shutil.rmtree(self._folder / CHECKPOINTS, ignore_errors=True)  # nothing is left to go on with
         if best is not None:
             best.save(self._folder / SOLUTION)
         figures = plan is not None and plan.recording.figures and best is not None
@@ -221,4 +242,4 @@ def _screen(outcome: Outcome, folder: Path, plan: Plan | None, keeper: _Keeper, 
     return "\n".join(lines)
 
 
-TOOL = Tool(PONN, build, run, member)
+TOOL = Tool(PONN, build, run, member, resume)

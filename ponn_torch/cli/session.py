@@ -20,7 +20,7 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import DictConfig, OmegaConf
 
-from ponn_torch.cli.job import BUG, INTERRUPTED, Outcome
+from ponn_torch.cli.job import BUG, INTERRUPTED, OVERRIDES, Outcome
 from ponn_torch.cli.overrides import Application, Command, InputError, composed, config_folder
 from ponn_torch.reporting.members import OUTCOME, natural
 from ponn_torch.settings import ConfigError
@@ -39,6 +39,7 @@ class Tool:
     build: Callable[[DictConfig], Any]
     run: Callable[[DictConfig, Path, Sequence[str], Any, Mapping[str, Any]], Outcome]
     member: Callable[[DictConfig], float]
+    resume: Callable[[DictConfig, Path, Sequence[str]], Outcome] | None = None
 
 
 def execute(command: Command, tool: Tool) -> int:
@@ -49,6 +50,9 @@ def execute(command: Command, tool: Tool) -> int:
     """
     if command.multirun:
         return _sweep(command, tool)
+    if command.resume is not None and command.config is not None:
+        with _termination_interrupts():
+            return _go_on(command.config, command.resume, command.overrides, tool)
     plan: Any = None
     if command.config is not None:
         try:
@@ -67,6 +71,20 @@ def execute(command: Command, tool: Tool) -> int:
     with _termination_interrupts():
         _under_hydra(tool.application, task, command.options, command.overrides)
     return outcomes[0].exit_code if outcomes else 0
+
+
+def _go_on(config: DictConfig, folder: Path, overrides: list[str], tool: Tool) -> int:
+    """Take a run up again in its own folder."""
+    path = folder / OVERRIDES
+    before = list(OmegaConf.load(path)) if path.is_file() else []
+    changed = [text.partition("=")[0] for text in overrides]
+    kept = [str(text) for text in before if str(text).partition("=")[0] not in changed]
+    try:
+        tool.build(config)
+    except ConfigError as error:
+        raise InputError(error) from error
+    assert tool.resume is not None
+    return tool.resume(config, folder, [*kept, *overrides]).exit_code
 
 
 def _member(tool: Tool, config: DictConfig, plan: Any = None) -> Outcome:

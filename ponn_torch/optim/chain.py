@@ -41,6 +41,9 @@ class Chain:
         first, done, saved = 0, OptimizeResult(xi, xi.new_tensor(torch.inf), Status.INTERRUPTED), None
         if checkpoint is not None and checkpoint.saved is not None:
             first, done, saved = _restore(checkpoint.saved, xi)
+            r = residual.residual(done.xi)
+            for entry in done.records if on_iteration is not None else ():
+                on_iteration(entry, done.xi, r)  # type: ignore[misc]
         for index in range(first, len(self.parts)):
             nested = None if checkpoint is None else Nested(checkpoint, _pack(index, done), saved)
             told = None if on_iteration is None else _continued(done, on_iteration)

@@ -168,6 +168,8 @@ def drive(
 ) -> OptimizeResult:
     """Run a method from ξ (..., N), or from where its checkpoint stands, until a stopping rule fires.
 
+    A run that goes on tells its callback of the iterations before too, with the best point that it goes on from.
+
     Raises:
         NonFiniteResidual: r is not finite at the start, in no member of a batch.
     """
@@ -183,13 +185,17 @@ def drive(
         last = progress.records[-1] if progress.records else {"residuals": 0, "linearisations": 0}
         counted.n_residuals, counted.n_derivatives = int(last["residuals"]), int(last["linearisations"])
     before, cut = progress.seconds, None
+    untold = list(progress.records) if on_iteration is not None else []  # of a run that goes on
 
     def keep() -> None:
         if checkpoint is not None:
             checkpoint.save(within("state", pack(state)) | within("progress", progress.pack()))
 
-    while bool((progress.code == RUNNING).any()):
+    while untold or bool((progress.code == RUNNING).any()):
         try:
+            if untold and on_iteration is not None:
+                on_iteration(untold.pop(0), progress.xi, progress.r)
+                continue
             running = progress.code == RUNNING
             following, move = method.step(counted, state, running)
             advanced, entry = _advance(progress, following, move, running, rule, counted, before + watch.seconds)

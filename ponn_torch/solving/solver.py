@@ -21,6 +21,7 @@ from ponn_torch.optim.base import (
     Optimizer,
     OptimizeResult,
     Record,
+    Residual,
     Status,
     Stop,
     Stopping,
@@ -30,12 +31,14 @@ from ponn_torch.optim.least_squares import LevenbergMarquardt
 from ponn_torch.optimal_control.collocation import Collocation
 from ponn_torch.optimal_control.curve import Curve
 from ponn_torch.optimal_control.discretisation import Discretisation, Form, Strong
+from ponn_torch.optimal_control.measurements import Measured, MeasurementFile, Measurements
 from ponn_torch.optimal_control.pontryagin import BoundaryValueProblem, pontryagin
 from ponn_torch.optimal_control.problem import OptimalControlProblem
 from ponn_torch.solving import refinement as refinements
 from ponn_torch.solving.certificate import Certificate, Tolerances, certify
 from ponn_torch.solving.continuation import Ladder, Outcome, Schedule
 from ponn_torch.solving.guess import Guess, RandomGuess, project
+from ponn_torch.solving.journal import Journal
 from ponn_torch.solving.observer import Observer, SilentObserver, StageResult
 from ponn_torch.solving.refinement import Refinement
 from ponn_torch.solving.solution import Solution
@@ -78,6 +81,7 @@ class Solver:
         start_limit: ‖r‖ of the first stage above which a start has failed.
         trust: a stage is kept while its off-node residual is below this fraction of the largest rate; below the
             resolution of the nodes the residual between them gives a broken stage away.
+        data: measurements that join the smoothed stages' residual; a refinement solves the problem as stated.
         cpu_seconds: budget of the whole solve, certificates apart; what there is when it is spent is kept.
     """
 
@@ -96,6 +100,7 @@ class Solver:
     start_limit: float = 0.1
     trust: float = 0.02
     mass_variable: str = "auto"
+    data: Measurements | MeasurementFile | None = None
     cpu_seconds: float = math.inf
     tolerances: Tolerances = field(default_factory=Tolerances)
     dtype: torch.dtype = torch.float64
@@ -109,9 +114,18 @@ class Solver:
         if not self.cpu_seconds > 0:
             raise ValueError(f"cpu_seconds = {self.cpu_seconds}; allowed: a positive number")
 
-    def solve(self, problem: OptimalControlProblem, seed: int = 0, observer: Observer | None = None) -> SolveResult:
-        """Solve from random starts of ``seed``; the result's message says what happened, it does not raise."""
-        return _Run(self, problem, seed, observer or SilentObserver()).result()
+    def solve(
+        self,
+        problem: OptimalControlProblem,
+        seed: int = 0,
+        observer: Observer | None = None,
+        journal: Journal | None = None,
+    ) -> SolveResult:
+        """Solve from random starts of ``seed``; the result's message says what happened, it does not raise.
+
+        A ``journal`` keeps what the smoothed stages computed, or gives it back.
+        """
+        return _Run(self, problem, seed, observer or SilentObserver(), journal).result()
 
     def discretisation(self, bvp: BoundaryValueProblem, form: Form | None = None) -> Discretisation:
         like = bvp.unit
@@ -127,9 +141,10 @@ class _Iterate:
     collocation: Collocation
     xi: Tensor
     residual: Tensor
+    equations: Residual
 
     def blocks(self) -> Mapping[str, float]:
-        return {name: float(value) for name, value in self.collocation.blocks(self.residual).items()}
+        return {name: float(value) for name, value in self.equations.blocks(self.residual).items()}
 
     def cost(self) -> float:
         return float(self.collocation.cost(self.xi))
@@ -155,6 +170,10 @@ class Budget:
     def __exit__(self, *_: object) -> None:
         self._before, self._running = self.seconds, False
 
+    def add(self, seconds: float) -> None:
+        """Count seconds that were spent before."""
+        self._before += seconds
+
     @property
     def seconds(self) -> float:
         return self._before + (self._watch.seconds if self._running else 0.0)
@@ -167,7 +186,14 @@ class Budget:
 class _Run:
     """One solve: holds the stages so far, so that nothing computed is lost whatever ends it."""
 
-    def __init__(self, solver: Solver, problem: OptimalControlProblem, seed: int, observer: Observer) -> None:
+    def __init__(
+        self,
+        solver: Solver,
+        problem: OptimalControlProblem,
+        seed: int,
+        observer: Observer,
+        journal: Journal | None = None,
+    ) -> None:
         self.solver, self.problem, self.seed, self.observer = solver, problem, seed, observer
         self.bvp = pontryagin(problem, mass_variable=solver.mass_variable, dtype=solver.dtype, device=solver.device)
         self.discretisations: dict[Form, Discretisation] = {}
@@ -175,7 +201,8 @@ class _Run:
         self.start = 0
         self.refused: list[Tensor] = []  # where smoothed solutions began whose refinement failed
         self.note = ""
-        self.clock = Budget(solver.cpu_seconds)
+        self.clock, self.journal = Budget(solver.cpu_seconds), journal
+        self.measurements = None if solver.data is None else solver.data.of(problem)
 
     # -- the line ------------------------------------------------------------------------------------------------------
 
@@ -271,10 +298,12 @@ class _Run:
                 message = str(error)
                 return Outcome.ABORT if first else Outcome.FAILED
             solution = self._record("smooth", Curve(trial, result.xi), result)
-            failed = not float(result.norm) < solver.start_limit
+            # measurements need not fit: what counts are the equations
+            norm = float(result.norm if self.measurements is None else trial.residual(result.xi).norm())
+            failed = not norm < solver.start_limit
             if first and failed:
                 message = (
-                    f"start {self.start + 1} of seed {self.seed} failed: ‖r‖ = {float(result.norm):.2g} "
+                    f"start {self.start + 1} of seed {self.seed} failed: ‖r‖ = {norm:.2g} "
                     f"after the first stage ({result.status.value})"
                 )
                 return Outcome.ABORT
@@ -335,11 +364,13 @@ class _Run:
 
     # -- bookkeeping -------------------------------------------------------------------------------------------------
 
-    def _callback(self, collocation: Collocation) -> Callback:
+    def _callback(self, collocation: Collocation, residual: Residual | None = None) -> Callback:
         """Tell the observer of an optimiser's iterations, and end the run when its time is spent."""
 
+        equations = residual or collocation
+
         def on_iteration(record: Record, xi: Tensor, residual: Tensor) -> None:
-            self.observer.iteration(record, _Iterate(collocation, xi, residual))
+            self.observer.iteration(record, _Iterate(collocation, xi, residual, equations))
             if self.clock.spent:
                 raise Stop(Status.BUDGET)
 
@@ -347,7 +378,13 @@ class _Run:
 
     def _optimise(self, name: str, collocation: Collocation, xi: Tensor, optimizer: Optimizer) -> OptimizeResult:
         self.observer.stage_started(name, _smoothing(collocation), len(self.stages))
-        result = optimizer.run(collocation, xi, self._callback(collocation))
+        measured = self.measurements
+        residual: Residual = collocation if measured is None else Measured(collocation, measured)
+        told = self._callback(collocation, residual)
+        if self.journal is None:
+            result = optimizer.run(residual, xi, told)
+        else:
+            result = self.journal.run(optimizer, residual, xi, told, self.clock.add)
         if result.status is Status.INTERRUPTED:
             self._record(name, Curve(collocation, result.xi), result)
             raise _Interrupted

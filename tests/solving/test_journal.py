@@ -1,0 +1,68 @@
+"""A journal gives a solve back what it had computed; with nothing in it, resuming is an error."""
+
+import pytest
+import torch
+from helpers import problem
+
+from ponn_torch.ansatz.basis import Chebyshev
+from ponn_torch.optim.base import Status
+from ponn_torch.solving.continuation import Ladder
+from ponn_torch.solving.journal import Journal
+from ponn_torch.solving.observer import Observer
+from ponn_torch.solving.solver import Solver
+
+SMALL = Solver(Chebyshev(12), n_nodes=20, continuation=Ladder((1.0, 0.5, 0.2)), refinement=None, start_limit=10.0)
+
+
+class Watching(Observer):
+    """Notes every iteration, and presses Ctrl-C at one of them."""
+
+    def __init__(self, stop: int = 0) -> None:
+        self.seen, self.stop = [], stop
+
+    def iteration(self, record, look):
+        self.seen.append({key: value for key, value in record.items() if key != "seconds"})
+        if len(self.seen) == self.stop:
+            raise KeyboardInterrupt
+
+
+@pytest.mark.parametrize("stop", [2, 14, 19])
+def test_a_solve_is_taken_up_where_it_was_interrupted(stop, tmp_path):
+    whole, cut, again = Watching(), Watching(stop), Watching()
+    expected = SMALL.solve(problem("mars_landing"), 0, whole)
+    interrupted = SMALL.solve(problem("mars_landing"), 0, cut, Journal(tmp_path))
+    assert interrupted.interrupted
+    assert interrupted.stages[-1].status is Status.INTERRUPTED
+    assert len(whole.seen) > stop
+    journal = Journal(tmp_path, resume=True)
+    result = SMALL.solve(problem("mars_landing"), 0, again, journal)
+    assert torch.equal(result.solution.curve.xi, expected.solution.curve.xi)
+    assert again.seen == whole.seen  # the observer is told everything anew
+    assert [stage.status for stage in result.stages] == [stage.status for stage in expected.stages]
+    assert [stage.n_residuals for stage in result.stages] == [stage.n_residuals for stage in expected.stages]
+    # what an earlier process spent counts
+    assert result.cpu_seconds >= sum(stage.cpu_seconds for stage in interrupted.stages[:-1])
+
+
+def test_what_was_finished_is_not_computed_again(tmp_path):
+    SMALL.solve(problem("mars_landing"), 0, None, Journal(tmp_path))
+    assert len(list(tmp_path.iterdir())) == 3
+
+    class Broken:
+        def run(self, *_):
+            raise AssertionError("an optimiser ran")
+
+    journal = Journal(tmp_path, resume=True)
+    for _ in range(3):
+        result = journal.run(Broken(), Anything(), torch.zeros(3, dtype=torch.float64))
+        assert result.n_iterations > 0
+
+
+class Anything:
+    def residual(self, xi):
+        return xi
+
+
+def test_a_resume_that_finds_nothing_is_an_error(tmp_path):
+    with pytest.raises(FileNotFoundError, match="nothing to resume"):
+        Journal(tmp_path, resume=True)
