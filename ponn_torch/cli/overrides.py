@@ -46,7 +46,7 @@ class InputError(ValueError):
 
 @dataclass(frozen=True)
 class Command:
-    """Hydra's options, overrides, the config of a single run (None for a sweep, or an inspection), a folder to resume."""
+    """Hydra's options, overrides, the config of a single run (None for sweeps and inspections), a folder to resume."""
 
     options: list[str]
     overrides: list[str]

@@ -72,6 +72,10 @@ class DenseJacobian:
     def _normal(self) -> Tensor:
         return self.matrix.mT @ self.matrix
 
+    def scaled_rows(self, factors: Tensor) -> DenseJacobian:
+        """diag(factors) J, factors (R,)."""
+        return DenseJacobian(factors.unsqueeze(-1) * self.matrix)
+
     def column_norms(self) -> Tensor:
         """(..., N)."""
         return torch.linalg.vector_norm(self.matrix, dim=-2)
@@ -171,6 +175,12 @@ class ArrowJacobian:
         out = segments.new_zeros(*segments.shape[:-1], self.n_shared + 1)
         index = self.index.unsqueeze(-2).expand(segments.shape)
         return out.scatter_add_(-1, index, segments)[..., :-1]
+
+    def scaled_rows(self, factors: Tensor) -> ArrowJacobian:
+        """diag(factors) J, factors (R,) of all rows."""
+        segments, extra = self._split_rows(factors)
+        column = segments.unsqueeze(-1)
+        return ArrowJacobian(column * self.local, column * self.shared, extra.unsqueeze(-1) * self.extra, self.index)
 
     def column_norms(self) -> Tensor:
         own = torch.linalg.vector_norm(self.local, dim=-2).flatten(-2)

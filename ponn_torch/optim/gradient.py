@@ -12,6 +12,7 @@ from torch import Tensor
 from ponn_torch.optim.base import Callback, OptimizeResult, Residual, Stopping
 from ponn_torch.optim.checkpoint import Arrays, Checkpoint
 from ponn_torch.optim.driver import Counted, Move, drive, restored
+from ponn_torch.optim.weighted import BALANCES
 
 
 def single(xi: Tensor) -> None:
@@ -47,11 +48,12 @@ SCHEDULES: dict[str, Callable[[float, float], float]] = {
 
 @dataclass(frozen=True)
 class AdamState:
-    """Where Adam stands: ξ, r and Jᵀr there, both moments and their age, and what is left of the learning rate."""
+    """Where Adam stands: ξ, r, JᵀW²r, W, both moments and their age, and what is left of the learning rate."""
 
     xi: Tensor
     r: Tensor
     gradient: Tensor
+    weights: Tensor
     mean: Tensor
     square: Tensor
     age: int
@@ -68,6 +70,7 @@ class Adam:
     Attributes:
         rate: learning rate at the start. schedule: one of SCHEDULES, from ``rate`` to ``rate·last``.
         memory, square_memory: decay of the first and second moment.
+        balance: one of BALANCES, which weighs the equations anew every ``balance_every`` iterations.
     """
 
     stopping: Stopping = field(default_factory=lambda: Stopping(decrease=0.0, max_iterations=5000))
@@ -77,10 +80,16 @@ class Adam:
     memory: float = 0.9
     square_memory: float = 0.999
     epsilon: float = 1e-8
+    balance: str = "none"
+    balance_every: int = 100
 
     def __post_init__(self) -> None:
         if self.schedule not in SCHEDULES:
             raise ValueError(f"schedule = {self.schedule!r}; allowed: {', '.join(SCHEDULES)}")
+        if self.balance not in BALANCES:
+            raise ValueError(f"balance = {self.balance!r}; allowed: {', '.join(BALANCES)}")
+        if self.balance_every < 1:
+            raise ValueError(f"balance_every = {self.balance_every}; allowed: at least 1")
         for name in ("rate", "last", "epsilon"):
             if not 0 < getattr(self, name) < math.inf:
                 raise ValueError(f"{name} = {getattr(self, name)}; allowed: a positive number")
@@ -106,9 +115,12 @@ class Adam:
     def begin(self, residual: Counted, xi: Tensor) -> AdamState:
         r, gradient = residual.gradient(xi)
         zero = torch.zeros_like(xi)
-        return AdamState(xi, r, gradient, zero, zero, age=0, iteration=0, caution=1.0)
+        return AdamState(xi, r, gradient, torch.ones_like(r), zero, zero, age=0, iteration=0, caution=1.0)
 
     def step(self, residual: Counted, state: AdamState, running: Tensor) -> tuple[AdamState, Move]:
+        if self.balance != "none" and state.iteration % self.balance_every == 0:
+            weights = BALANCES[self.balance](residual, state.xi, state.r)
+            state = replace(state, weights=weights, gradient=residual.gradient(state.xi, weights)[1])
         age, iteration = state.age + 1, state.iteration + 1
         share = min(state.iteration / max(self.stopping.max_iterations - 1, 1), 1.0)
         rate = self.rate * state.caution * SCHEDULES[self.schedule](share, self.last)
@@ -117,10 +129,10 @@ class Adam:
         spread = (square / (1 - self.square_memory**age)).sqrt() + self.epsilon
         step = -rate / (1 - self.memory**age) * mean / spread
         xi = state.xi + step
-        r, gradient = residual.gradient(xi)
+        r, gradient = residual.gradient(xi, state.weights)
         before, after = state.r.square().sum(), r.square().sum()
         if bool(torch.isfinite(after) & torch.isfinite(gradient).all()):
-            following = AdamState(xi, r, gradient, mean, square, age, iteration, state.caution)
+            following = AdamState(xi, r, gradient, state.weights, mean, square, age, iteration, state.caution)
         else:
             zero = torch.zeros_like(xi)
             following = replace(state, mean=zero, square=zero, age=0, iteration=iteration, caution=0.5 * state.caution)
