@@ -215,7 +215,7 @@ def _rehearse(plan: Plan) -> None:
     except ValueError as error:
         raise ConfigError(located(error, "", ["mass_variable"], label="problem")) from error
     try:
-        _ = solver.discretisation(bvp).groups
+        _ = solver.discretisation(bvp).expressions
         solver.guess.curve(bvp, 1000 * plan.seed)
         if solver.data is not None:
             solver.data.of(plan.problem)
