@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from ponn_torch.baselines.answer import DirectSolution
-from ponn_torch.baselines.transcription import Answer, Array, Phase, Point, Program
+from ponn_torch.baselines.transcription import Answer, Array, PathConstraints, Phase, Point, Program
 from ponn_torch.optim.base import Stopwatch
 from ponn_torch.optimal_control.control_laws import LOWER, UPPER, Regime
 from ponn_torch.optimal_control.pontryagin import Setting, pontryagin
@@ -77,12 +77,14 @@ class Unstructured:
     Attributes:
         guess: a guess of the indirect solver for the states; a straight line where it is None.
         softening: see ``control_variables``; the answer's cost is too good by about this fraction of its thrust.
+        path_constraints: see ``Program``.
     """
 
     n_segments: int = 40
     degree: int = 2
     guess: Guess | None = None
     softening: float = 1e-4
+    path_constraints: PathConstraints | None = None
     options: dict[str, Any] = field(default_factory=dict)
 
     def solve(self, problem: OptimalControlProblem) -> DirectSolution:
@@ -92,7 +94,14 @@ class Unstructured:
             ImportError: no CasADi. TypeError, ValueError: a problem that it cannot be told of.
         """
         phases = (Phase(self.n_segments),)
-        program = Program(problem, phases, self.degree, self.softening, options=self.options)
+        program = Program(
+            problem,
+            phases,
+            self.degree,
+            self.softening,
+            path_constraints=self.path_constraints,
+            options=self.options,
+        )
         build = program.build()
         watch = Stopwatch()
         answer = program.solve(straight(program) if self.guess is None else guessed(program, self.guess))

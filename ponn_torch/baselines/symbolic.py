@@ -51,13 +51,18 @@ class _OnSymbols(fx.Interpreter):
     """Runs a graph of ATen operations on arrays of symbols."""
 
     def call_function(self, target: Any, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
-        name = str(target).removeprefix("aten.").split(".")[0]
+        name = target.__name__.split(".")[0]
         operation = _operations().get(name)
         if operation is None:
             raise ValueError(f"no CasADi counterpart of torch operation {name!r}; allowed: {', '.join(_operations())}")
-        return operation(
-            *args, **{key: value for key, value in kwargs.items() if key in ("dim", "alpha", "min", "max")}
-        )
+        known = {key: value for key, value in kwargs.items() if key in ("dim", "alpha", "min", "max")}
+        found = operation(*args, **known)
+        if isinstance(found, np.ndarray | list):
+            return found
+        # NumPy unpacks what has no dimension, and CasADi would then take over the next product with an array
+        single = np.empty(1, dtype=object)
+        single[0] = found
+        return single.reshape(())
 
     def get_attr(self, target: Any, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
         value = super().get_attr(target, args, kwargs)
@@ -143,6 +148,10 @@ def _operations() -> dict[str, Callable[..., Any]]:
         "dot": np.matmul,
         "cat": lambda arrays, dim=0: np.concatenate(arrays, axis=dim),
         "stack": lambda arrays, dim=0: np.stack(arrays, axis=dim),
+        "split": lambda x, size, dim=0: np.split(x, range(size, x.shape[dim], size), axis=dim),
+        "split_with_sizes": lambda x, sizes, dim=0: np.split(x, np.cumsum(sizes)[:-1], axis=dim),
+        "unbind": lambda x, dim=0: [np.take(x, i, axis=dim) for i in range(x.shape[dim])],
+        "getitem": lambda x, index: x[index],
         "select": lambda x, dim, index: np.take(x, index, axis=dim),
         "slice": slice_,
         "expand": expand,

@@ -8,7 +8,7 @@ multipliers of the defects: λ = −Λ/w (covector mapping, w the quadrature wei
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
@@ -25,6 +25,7 @@ from ponn_torch.optim.base import Stopwatch
 from ponn_torch.optimal_control.problem import Named, OptimalControlProblem
 
 Array = NDArray[np.float64]
+PathConstraints = Callable[[Tensor, Named, Named, Named], Tensor]
 
 
 @dataclass(frozen=True)
@@ -84,6 +85,8 @@ class Program:
         softening: of the control set where it is not pinned, see ``control_variables``.
         shortest: least duration of a phase, as a fraction of the (guessed) final time. Where it were zero, a phase
             without duration would be stationary whatever its control.
+        path_constraints: (t, x, u, p) → (..., k) of order one, at most zero at every Radau point; the direct method
+            can impose what the indirect one cannot.
         options: for IPOPT.
     """
 
@@ -92,6 +95,7 @@ class Program:
     degree: int = 4
     softening: float = 0.0
     shortest: float = 1e-4
+    path_constraints: PathConstraints | None = None
     options: dict[str, Any] = field(default_factory=dict)
 
     @cached_property
@@ -131,7 +135,7 @@ class Program:
 
     @cached_property
     def _pointwise(self) -> Any:
-        """(t, x, ν) → scaled (rates, running cost, rows of the control) at one node."""
+        """(t, x, ν) → scaled (rates, running cost, rows of the control and of the path) at one node."""
         ca, problem, variables = load_casadi(), self.problem, self.variables
         unit, time_unit = torch.from_numpy(self.state_unit), problem.unit("time")
 
@@ -144,6 +148,8 @@ class Program:
             if problem.running_cost is not None:
                 cost = problem.running_cost(seconds, named, u, p) * (time_unit / problem.unit("cost"))
             rows = [] if variables.rows is None else [variables.rows(nu)]
+            if self.path_constraints is not None:
+                rows.append(self.path_constraints(seconds, named, u, p))
             return torch.cat([rates, cost, *rows], -1)
 
         symbols = [ca.SX.sym(name, size) for name, size in (("t", 1), ("x", len(unit)), ("nu", variables.size))]
@@ -190,7 +196,7 @@ class Program:
         by_node = constant(np.kron(np.eye(self.n_segments), np.ones((1, d))))
         step = ca.mtimes(lengths, by_node)
         times = ca.mtimes(starts, by_node) + step * ca.DM(np.tile(self.rule.points, self.n_segments)).T
-        rates, cost, control_rows = self._pointwise.map(n_nodes)(times, states[:, 1:], controls)
+        rates, cost, node_rows = self._pointwise.map(n_nodes)(times, states[:, 1:], controls)
         derivative = np.zeros((n_nodes + 1, n_nodes))
         for k in range(self.n_segments):
             derivative[k * d : k * d + d + 1, k * d : (k + 1) * d] = self.rule.derivative.T
@@ -198,13 +204,16 @@ class Program:
         end_cost, manifold = self._terminal(ca.sum1(durations), states[:, -1])
         quadrature = ca.DM(np.tile(self.rule.weights, self.n_segments)).T
         objective = ca.sum2(cost * step * quadrature) + end_cost
-        rows = [ca.vec(defects), ca.vec(control_rows), manifold, ca.sum1(durations)]
+        rows = [ca.vec(defects), ca.vec(node_rows), manifold, ca.sum1(durations)]
         sizes = [row.numel() for row in rows]
         limits = self._limits
+        path = node_rows.shape[0] - self.variables.n_rows  # these come last at every node
+        row_lower = [value for limit in limits for value in (*limit.row_lower, *[-np.inf] * path)]
+        row_upper = [value for limit in limits for value in (*limit.row_upper, *[0.0] * path)]
         total = [0.0, np.inf] if self.problem.free_final_time else [self._final_time] * 2
         still = np.zeros(sizes[0]), np.zeros(sizes[2])
-        rows_lower = np.concatenate([still[0], *(limit.row_lower for limit in limits), still[1], total[:1]])
-        rows_upper = np.concatenate([still[0], *(limit.row_upper for limit in limits), still[1], total[1:]])
+        rows_lower = np.concatenate([still[0], row_lower, still[1], total[:1]])
+        rows_upper = np.concatenate([still[0], row_upper, still[1], total[1:]])
         unknowns = ca.vertcat(durations, ca.vec(states), ca.vec(controls))
         options = {
             "print_time": False,

@@ -22,6 +22,7 @@ FUNCTIONS: dict[str, Callable[[Tensor], Tensor]] = {
     "matrix from the left": lambda x: torch.einsum("ij,...j->...i", x.new_tensor(MATRIX), x),
     "cross": lambda x: torch.stack([x[..., 1], -x[..., 0], torch.zeros_like(x[..., 0])], -1),
     "slices": lambda x: torch.cat([x[..., 1:], 2.0 - x[..., :1], x.new_zeros(*x.shape[:-1], 1)], -1),
+    "pieces": lambda x: torch.cat([*x.split(2, -1), *x.split((1, 2), -1)], -1) * torch.stack(x.unbind(-1), -1).sum(),
     "angles": lambda x: torch.atan2(torch.sin(x), torch.cos(x)) + torch.tan(x) * torch.tanh(x),
     "exponentials": lambda x: torch.exp(-x) + torch.log(x) + torch.log1p(x) + torch.sigmoid(x) + torch.expm1(x),
     "choices": lambda x: torch.where(x > 1.0, x**2, x.clamp(0.8, 1.2)) + torch.minimum(x, 1.0 / x).abs(),
