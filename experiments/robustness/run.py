@@ -35,9 +35,9 @@ def _row(problem: OptimalControlProblem, index: int, result: SolveResult, data: 
     return found
 
 
-def landings(count: int) -> Report:
+def landings(count: int, seed: int = 0) -> Report:
     """States in ±2 km × ±1 km × 1.2–2.5 km, ±90, ±60, −90…−30 m/s; free final time, guessed as 45 s."""
-    generator, rows = np.random.default_rng(0), []
+    generator, rows = np.random.default_rng(seed), []
     r = generator.uniform((-2000, -1000, 1200), (2000, 1000, 2500), (count, 3))
     v = generator.uniform((-90, -60, -90), (90, 60, -30), (count, 3))
     for i in range(count):
@@ -58,9 +58,9 @@ def landings(count: int) -> Report:
     return _report("landings", rows, {"dip below ground": str(below)})
 
 
-def transfers(count: int) -> Report:
+def transfers(count: int, seed: int = 0) -> Report:
     """Thirds: tf 308–450 d at 0.5 N; Tmax 0.33–0.7 N at 348.795 d; both at random. Infeasible ones by minimum time."""
-    generator, rows = np.random.default_rng(0), []
+    generator, rows = np.random.default_rng(seed), []
     days, newtons = generator.uniform(308, 450, count), generator.uniform(0.33, 0.7, count)
     days[count // 3 : 2 * count // 3], newtons[: count // 3] = 348.795, 0.5
     for i in range(count):
@@ -107,11 +107,12 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--parts", nargs="+", choices=PARTS, default=list(PARTS))
     parser.add_argument("--count", type=int, help="cases of every part (default: 300 landings, 100 transfers)")
+    parser.add_argument("--seed", type=int, default=0, help="of the generator of the cases (default: 0, the tables')")
     parser.add_argument("--check-only", action="store_true", help="do not write results")
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     chosen = {name: PARTS[name] for name in arguments.parts}
-    parts = {name: partial(run, arguments.count or count) for name, (run, count) in chosen.items()}
+    parts = {name: partial(run, arguments.count or count, arguments.seed) for name, (run, count) in chosen.items()}
     return run_study(FOLDER, parts, check_only=arguments.check_only)
 
 

@@ -367,3 +367,24 @@ def test_a_setting_of_parameters_is_made_from_the_problem():
         "tide": 0.5,
     }
     assert isinstance(made.setting, Setting)
+
+
+# -- segments that vanish ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("length", [1e-2, 1e-5, 1e-8])
+def test_a_vanishing_segment_does_not_hide_a_jump(length):
+    """A velocity of 0.5 that a last push ends in no time: a free impulse, were it not for h₀/h."""
+    bvp = bvp_of("minimum_fuel")
+    disc = Discretisation(bvp, Chebyshev(6), make_nodes("legendre_gauss", 9, dtype=torch.float64))
+    guess = torch.tensor([0.0, 2.0, 3.0], dtype=torch.float64)
+    setting = Setting(Regime(arcs=torch.tensor([[0], [2]])))
+    made = Collocation.on_segments(disc, guess, events=[0], setting=setting)
+    unknowns = made.unpack(torch.zeros(made.n_unknowns, dtype=torch.float64))
+    unknowns.knots[1, :2] = torch.tensor([1.0, 0.5])
+    assert unknowns.knots[2, :2].tolist() == [1.0, 0.0]
+    times = torch.tensor([0.0, 3.0 - length, 3.0], dtype=torch.float64)
+    residual = made.residual(made.pack(replace(unknowns, times=times)))
+    last = residual[: 2 * disc.n_rows].view(2, -1)[1]
+    # ∫(y″)² dz ≥ (h Δv)²/2 over z ∈ [−1, 1], times h₀/h with h₀ = 0.5, less what the push does in this time
+    assert float(last.norm()) > 0.5 * 0.5 / math.sqrt(2) - length
