@@ -17,27 +17,27 @@ from ponn_torch.optimal_control.discretisation import Discretisation, Strong
 from ponn_torch.optimal_control.expressions import LinearExpressions
 from ponn_torch.optimal_control.pontryagin import BoundaryValueProblem
 
-ScaledCurve = Callable[[Tensor], Tensor]  # scaled times (m,) → w (m, 2n)
+ScaledCurve = Callable[[Tensor], Tensor]  # scaled times (..., m) → w (..., m, 2n)
 
 
 def project(collocation: Collocation, curve: ScaledCurve, times: Tensor | None = None) -> Tensor:
-    """ξ (N,) whose expressions fit ``curve`` at the nodes, in least squares; known knot entries keep their values.
+    """ξ (..., N) whose expressions fit ``curve`` at the nodes, in least squares; known knot entries keep their values.
 
-    One call behind first guesses, warm starts, more neurons and other segments. ``times`` (K+1,) are knot times to use
-    in place of the collocation's own.
+    One call behind first guesses, warm starts, more neurons and other segments. ``times`` (..., K+1) are knot times to
+    use in place of the collocation's own.
     """
     disc = collocation.discretisation
     times = collocation.known_times if times is None else times
     known = collocation.known_knots
     knots = torch.where(torch.isnan(known), curve(times), known)
-    h = (times[1:] - times[:-1]) / 2
-    t = times[:-1, None] + h[:, None] * (disc.nodes.points + 1.0)
-    values = curve(t.flatten()).unflatten(0, t.shape)
+    h = (times[..., 1:] - times[..., :-1]) / 2
+    t = times[..., :-1, None] + h[..., None] * (disc.nodes.points + 1.0)
+    values = curve(t.flatten(-2)).unflatten(-2, t.shape[-2:])
     unknowns = Unknowns(
-        weights=values.new_zeros(collocation.n_segments, disc.n_own),
+        weights=values.new_zeros(*times.shape[:-1], collocation.n_segments, disc.n_own),
         knots=knots,
         times=times,
-        multipliers=values.new_zeros(collocation.bvp.n_multipliers),
+        multipliers=values.new_zeros(*times.shape[:-1], collocation.bvp.n_multipliers),
     )
     kappas, _ = collocation.kappas(unknowns, h)
     weights = disc.expressions.fit([values[..., group.columns[:, 0]] for group in disc.groups], kappas)

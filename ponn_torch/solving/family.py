@@ -1,0 +1,195 @@
+"""Trajectories with the same arcs from different starts: solved warm, together, in one batch of the split.
+
+A neighbour of a solved problem needs no smoothing and no search: its arcs are known, its switch times nearly. That is
+what a controller solves every cycle from the state it has been flown to, and what a dispersion study solves per sample.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import torch
+from torch import Tensor
+
+from ponn_torch.optim.base import Status, Stopping
+from ponn_torch.optim.least_squares import LevenbergMarquardt
+from ponn_torch.optimal_control.collocation import Collocation, Unknowns
+from ponn_torch.optimal_control.control_laws import Minimiser, Regime
+from ponn_torch.optimal_control.curve import Curve
+from ponn_torch.optimal_control.discretisation import Discretisation
+from ponn_torch.optimal_control.pontryagin import Setting
+from ponn_torch.solving.guess import project
+from ponn_torch.solving.refinement import Segmentation
+
+
+def _warm() -> LevenbergMarquardt:
+    return LevenbergMarquardt(Stopping(tolerance=1e-9, decrease=1e-2, patience=2, max_iterations=12), damping=1e-8)
+
+
+@dataclass(frozen=True)
+class Restart:
+    """How a family is solved anew.
+
+    segmentation: size of the segments, and about how many there are. residual_tolerance: ‖r‖ above which a member is
+    not solved.
+    """
+
+    segmentation: Segmentation = field(default_factory=lambda: Segmentation(n_segments=4))
+    optimizer: LevenbergMarquardt = field(default_factory=_warm)
+    residual_tolerance: float = 1e-6
+
+
+@dataclass(frozen=True, eq=False)
+class Family:
+    """B trajectories with the same A arcs: one collocation, whose starting knots and times differ, and ξ (B, N)."""
+
+    collocation: Collocation
+    xi: Tensor
+
+    @classmethod
+    def of(cls, curve: Curve) -> Family:
+        """The family of one, from a curve on arcs.
+
+        Raises:
+            ValueError: a smoothed curve.
+        """
+        if curve.collocation.setting.regime.smoothing is not None:
+            raise ValueError(
+                f"smoothing = {float(curve.collocation.setting.regime.smoothing):g}; allowed: a split or an unbounded "
+                "control, of which the arcs are known"
+            )
+        made = curve.collocation
+        batched = replace(made, known_knots=made.known_knots[None], known_times=made.known_times[None])
+        return cls(batched, curve.xi[None])
+
+    def __len__(self) -> int:
+        return len(self.xi)
+
+    def __getitem__(self, members: Tensor) -> Family:
+        """Some of the members (B',), by index or mask; of a family of one, as many copies as asked for."""
+        made = self.collocation
+        chosen = replace(made, known_knots=made.known_knots[members], known_times=made.known_times[members])
+        return Family(chosen, self.xi[members])
+
+    def curve(self, member: int) -> Curve:
+        made = self.collocation
+        alone = replace(made, known_knots=made.known_knots[member], known_times=made.known_times[member])
+        return Curve(alone, self.xi[member])
+
+    @property
+    def unknowns(self) -> Unknowns:
+        return self.collocation.unpack(self.xi)
+
+    @property
+    def arc_knots(self) -> list[int]:
+        """Knots at which arcs begin and end, A + 1 of them."""
+        return [0, *self.collocation.switch_knots, self.collocation.n_segments]
+
+    @property
+    def n_arcs(self) -> int:
+        return len(self.arc_knots) - 1
+
+    @property
+    def arc_times(self) -> Tensor:
+        """Scaled times (B, A + 1) at which arcs begin and end, on the clock of all."""
+        return self.unknowns.times[:, self.arc_knots]
+
+    def _at(self, t: Tensor) -> tuple[Tensor, Tensor]:
+        """w (B, m, 2n) at scaled times (B, m), and the segments (B, m); both ends are held."""
+        unknowns = self.unknowns
+        segment = torch.searchsorted(unknowns.times[:, 1:-1].contiguous(), t.contiguous(), right=True)
+        inside = torch.minimum(torch.maximum(t, unknowns.times[:, :1]), unknowns.times[:, -1:])
+        return self.collocation.along(unknowns, inside, segment), segment
+
+    def __call__(self, t: Tensor) -> Tensor:
+        """w (B, m, 2n) at scaled times (B, m)."""
+        return self._at(t)[0]
+
+    def control(self, t: Tensor) -> dict[str, Tensor]:
+        """Control by name (B, m, ·) at scaled times (B, m), in the user's units."""
+        w, segment = self._at(t)
+        best = self._minimiser(t, w, self.collocation.setting.regime.arcs, segment)
+        return {name: value.unflatten(0, t.shape) for name, value in best.control.items()}
+
+    def _minimiser(self, t: Tensor, w: Tensor, arcs: Tensor | None, segment: Tensor) -> Minimiser:
+        one = t.new_ones(t.numel(), 1)
+        parameters = {name: value * one for name, value in self.collocation.setting.parameters.items()}
+        regime = Regime(arcs=None if arcs is None else arcs[segment.flatten()])
+        return self.collocation.bvp.minimiser(t.reshape(-1, 1), w.flatten(0, 1), Setting(regime, parameters))
+
+    def disagreement(self, n_points: int = 15) -> Tensor:
+        """How far S is on the wrong side of its arcs (B,), at points within every segment; 0 for a true extremal."""
+        made, arcs = self.collocation, self.collocation.setting.regime.arcs
+        if arcs is None:
+            return self.xi.new_zeros(len(self))
+        times = self.unknowns.times
+        inner = (torch.arange(n_points, dtype=times.dtype, device=times.device) + 0.5) / n_points
+        t = (times[:, :-1, None] + times.diff(dim=-1)[..., None] * inner).flatten(1)
+        segment = torch.arange(made.n_segments, device=t.device).repeat_interleave(n_points).expand(len(self), -1)
+        w = made.along(self.unknowns, t, segment)
+        switching = self._minimiser(t, w, None, segment).switching
+        wrong = made.bvp.law.arc_codes(switching) != arcs[segment.flatten()]
+        # S of a curved law comes in two halves, one per bound; the nearer of the two says how far
+        depth = torch.stack(switching.abs().chunk(2 if made.bvp.law.curved else 1, -1)).amin(0)
+        return torch.where(wrong, depth, torch.zeros_like(depth)).view(len(self), -1).amax(-1)
+
+    # -- the same arcs from elsewhere ----------------------------------------------------------------------------------
+
+    def restart(
+        self, states: Tensor, at: Tensor | float = 0.0, *, passed: int = 0, how: Restart | None = None
+    ) -> tuple[Family, Tensor]:
+        """The family from states (B, n) in the user's units at scaled times (B,), and who is solved (B,).
+
+        ``passed`` arcs lie behind, the same number for all. A family of one is the neighbour of all. Solved means a
+        small residual and S on the right side of every arc.
+
+        Raises:
+            ValueError: states whose shape does not fit, or no arc left.
+        """
+        how, bvp = how or Restart(), self.collocation.bvp
+        if states.dim() != 2 or states.shape[-1] != bvp.n_states or len(self) not in (1, len(states)):
+            raise ValueError(f"states have shape {tuple(states.shape)}; allowed: ({len(self)}, {bvp.n_states})")
+        if not 0 <= passed < self.n_arcs:
+            raise ValueError(f"passed = {passed}; allowed: 0 to {self.n_arcs - 1}, one arc has to be left")
+        whole = self if len(self) == len(states) else self[torch.zeros(len(states), dtype=torch.long)]
+        start = torch.as_tensor(at, dtype=self.xi.dtype, device=self.xi.device).expand(len(states))
+        collocation = whole._ahead(states, start, passed, how.segmentation)
+        guess = collocation.unpack(project(collocation, whole))
+        xi = collocation.pack(replace(guess, multipliers=whole.unknowns.multipliers))
+        result = how.optimizer.run(collocation, xi)
+        found = Family(collocation, result.xi)
+        stuck = torch.tensor([s in (Status.NON_FINITE, Status.DAMPING) for s in result.member_status])
+        small = (result.norm < how.residual_tolerance) | (result.norm < 1e-8) & stuck.to(result.norm.device)
+        return found, small & (found.disagreement() < 1e-6)
+
+    def _ahead(self, states: Tensor, start: Tensor, passed: int, segmentation: Segmentation) -> Collocation:
+        """The arcs that lie ahead, cut into segments in the same way for all members."""
+        made, bvp = self.collocation, self.collocation.bvp
+        ends = torch.cat([start[:, None], self.arc_times[:, passed + 1 :]], -1)
+        share = (ends.diff(dim=-1) / (ends[:, -1:] - ends[:, :1])).mean(0) * segmentation.n_segments
+        counts = share.round().clamp_min(1).long().tolist()
+        steps = [torch.arange(1, n + 1, dtype=ends.dtype, device=ends.device) / n for n in counts]
+        cuts = [ends[:, i, None] + step * ends.diff(dim=-1)[:, i, None] for i, step in enumerate(steps)]
+        times = torch.cat([ends[:, :1], *cuts], -1)
+        events: list[int | None] = []
+        for n, knot in zip(counts, [*self.arc_knots[passed + 1 : -1], None], strict=True):
+            events += [None] * (n - 1) + ([made.events[knot - 1]] if knot is not None else [])
+        regime, arcs = made.setting.regime, None
+        if regime.arcs is not None:
+            codes = regime.arcs[self.arc_knots[passed:-1]]
+            arcs = torch.cat([codes[i : i + 1].expand(n, -1) for i, n in enumerate(counts)])
+        disc = self._discretisation(segmentation)
+        shared = Collocation.on_segments(
+            disc, times[0], events=events, setting=replace(made.setting, regime=Regime(arcs=arcs))
+        )
+        knots = shared.known_knots.repeat(len(states), 1, 1)
+        known = bvp.to_scaled(states, torch.zeros_like(states))[:, : bvp.n_states]
+        given = ~torch.isnan(bvp.known_initial[: bvp.n_states])
+        knots[:, 0, : bvp.n_states] = torch.where(given, known, torch.nan)
+        return replace(shared, known_knots=knots, known_times=times)
+
+    def _discretisation(self, segmentation: Segmentation) -> Discretisation:
+        """The one of the family where it has the segmentation's size already: tables are kept from cycle to cycle."""
+        disc = self.collocation.discretisation
+        same = len(disc.nodes) == segmentation.n_nodes and disc.basis.size == segmentation.n_neurons
+        return disc if same else segmentation.discretisation(disc.bvp)
