@@ -199,6 +199,7 @@ def _solver(node: dict[str, Any], top: Mapping[str, Any]) -> Solver:
         "n_segments",
         "mass_variable",
         "start_limit",
+        "stage_tolerance",
         "trust",
         "tolerances",
     ):

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import Enum
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol, cast
 
 import torch
 from torch import Tensor
@@ -120,6 +120,15 @@ class Optimizer(Protocol):
     ) -> OptimizeResult:
         """Minimise ½‖r(ξ)‖² from ξ, or go on from where the checkpoint stands; never raises for want of convergence."""
         ...
+
+
+def loosened(optimizer: Optimizer, tolerance: float) -> Optimizer:
+    """The optimiser with no smaller tolerance than this; one without stopping rules of its own comes back as it is."""
+    made: Any = optimizer
+    rule = getattr(made, "stopping", None)
+    if not isinstance(rule, Stopping) or rule.tolerance >= tolerance:
+        return optimizer
+    return cast(Optimizer, replace(made, stopping=replace(rule, tolerance=tolerance)))
 
 
 class NonFiniteResidual(FloatingPointError):

@@ -26,6 +26,7 @@ from ponn_torch.optim.base import (
     Stop,
     Stopping,
     Stopwatch,
+    loosened,
 )
 from ponn_torch.optim.least_squares import LevenbergMarquardt
 from ponn_torch.optimal_control.collocation import Collocation
@@ -79,6 +80,7 @@ class Solver:
         n_starts: random starts to try at most; start i of seed s uses the random stream 1000 s + i.
         n_certified: stop at this many certified extremals and keep the cheapest; several extremals are real.
         start_limit: ‖r‖ of the first stage above which a start has failed.
+        stage_tolerance: ‖r‖ at which a stage ends that only leads to a refinement, if the optimiser asks for less.
         trust: a stage is kept while its off-node residual is below this fraction of the largest rate; below the
             resolution of the nodes the residual between them gives a broken stage away.
         data: measurements that join the smoothed stages' residual; a refinement solves the problem as stated.
@@ -98,6 +100,7 @@ class Solver:
     n_starts: int = 10
     n_certified: int = 1
     start_limit: float = 0.1
+    stage_tolerance: float = 1e-4
     trust: float = 0.02
     mass_variable: str = "auto"
     data: Measurements | MeasurementFile | None = None
@@ -270,6 +273,14 @@ class _Run:
     def _smoothable(self) -> bool:
         return self.bvp.law.n_switching > 0 and not self.bvp.law.curved
 
+    @property
+    def _stage_optimizer(self) -> Optimizer:
+        """A refinement that reads arcs solves everything anew: digits of the curve it starts from are wasted."""
+        solver, refinement = self.solver, self.solver.refinement
+        if refinement is None or not refinement.reads_arcs:
+            return solver.optimizer
+        return loosened(solver.optimizer, solver.stage_tolerance)
+
     def _continuation(self) -> tuple[Solution | None, str]:
         """Walk the schedule from one start; the sharpest stage that can be trusted, or None and why."""
         solver, bvp = self.solver, self.bvp
@@ -293,7 +304,7 @@ class _Run:
             elif not first:
                 return Outcome.ABORT  # nothing to smooth: one stage is all there is
             try:
-                result = self._optimise("smooth", trial, xi, solver.optimizer)
+                result = self._optimise("smooth", trial, xi, self._stage_optimizer)
             except NonFiniteResidual as error:
                 message = str(error)
                 return Outcome.ABORT if first else Outcome.FAILED

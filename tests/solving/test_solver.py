@@ -456,3 +456,12 @@ def test_a_problem_of_ones_own_takes_a_few_lines():
     result = Solver(guess=RandomGuess(scale=0.1)).solve(swing)
     assert result.certified, result.message
     assert len(pontryagin(swing).chains) == 2  # angle and rate, and their costates
+
+
+def test_stages_that_lead_to_a_split_end_early_and_others_do_not():
+    fuel = problem("mars_landing")
+    split = Solver(continuation=Single(1.0)).solve(fuel, 0)
+    alone = Solver(continuation=Single(1.0), refinement=None).solve(fuel, 0)
+    assert split.certified
+    assert 1e-6 < split.stages[0].norm < 1e-4
+    assert alone.stages[0].norm < 1e-6
