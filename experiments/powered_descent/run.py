@@ -27,7 +27,7 @@ STARTS: dict[str, dict[str, Any]] = {
     },
     "max-min-max (TFC test 2)": {"initial_velocity": (85.0, 50.0, -65.0), **TFC},
 }
-MARGINS = (1.0, 0.98, 0.95, 0.9)
+MARGINS = (1.0, 0.98, 0.95)
 MISS, IMPACT = 1.0, 0.1  # m and m/s within which a landing has succeeded
 
 

@@ -3,7 +3,7 @@
 On its last arc an optimal plan uses its whole bound, so a bound below what the engines give leaves the authority that
 errors need. On that arc, where the plan has no freedom of its own, the thrust is the one that reaches the target at the
 planned time with an acceleration linear in time, a(τ) = −6 r/T² − 4 v/T + τ (12 r/T³ + 6 v/T²) for T to go, divided by
-what the engines have been seen to give. In the last second nothing is measured any more: it would only add noise.
+what the engines have been seen to give. In the last two seconds nothing is measured any more: noise, divided by T², would use up the reserve.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ class Replanning:
 
     cycle: float = 1.0
     step: float = 0.1
-    blind: float = 1.0
+    blind: float = 2.0
     gain: float = 0.2
 
     def __post_init__(self) -> None:
