@@ -3,7 +3,8 @@
 On its last arc an optimal plan uses its whole bound, so a bound below what the engines give leaves the authority that
 errors need. On that arc, where the plan has no freedom of its own, the thrust is the one that reaches the target at the
 planned time with an acceleration linear in time, a(τ) = −6 r/T² − 4 v/T + τ (12 r/T³ + 6 v/T²) for T to go, divided by
-what the engines have been seen to give. In the last two seconds nothing is measured any more: noise, divided by T², would use up the reserve.
+what the engines have been seen to give. In the last two seconds nothing is measured any more: noise, divided by T²,
+would use up the reserve.
 """
 
 from __future__ import annotations
