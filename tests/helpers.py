@@ -15,6 +15,7 @@ from torch import Tensor
 import ponn_torch.problems
 from ponn_torch.ansatz.basis import Chebyshev, FreeFunction, GaussianRBF, Legendre, LinearBasis, RandomFeatures
 from ponn_torch.ansatz.networks import MLP, FrozenMLP
+from ponn_torch.ansatz.switch_neurons import SwitchNeuronBasis
 from ponn_torch.numerics.nodes import make_nodes
 from ponn_torch.optim.base import Optimizer, Stopping
 from ponn_torch.optim.chain import Chain
@@ -53,6 +54,7 @@ ANSATZES: dict[str, Callable[[int], LinearBasis]] = {
     "elm_gaussian": lambda size: RandomFeatures(size, "gaussian"),
     "gaussian_rbf": lambda size: GaussianRBF(size, 0.25 * size),
     "frozen_mlp": lambda size: FrozenMLP((12, size)),
+    "switch_neurons": lambda size: SwitchNeuronBasis(Chebyshev(size - 2), [-0.3, 0.4], [8.0, 20.0], [0, 1]),
 }
 NETWORKS: dict[str, Callable[[int], MLP]] = {
     "mlp": lambda size: MLP((8, size)),

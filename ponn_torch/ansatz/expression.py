@@ -44,11 +44,24 @@ def _orthonormal(table: Tensor, magnitude: Tensor, truncation: float) -> Tensor:
     return right[keep].T / singular[keep]
 
 
+def _ordered(table: Tensor, magnitude: Tensor, truncation: float) -> Tensor:
+    """Orthonormal columns in Gram-Schmidt order, without those that the ones before them span to half the digits."""
+    scale, remainder = _columns(table, magnitude, truncation), None
+    while remainder is None or bool((remainder <= torch.finfo(table.dtype).eps ** 0.5).any()):
+        if remainder is not None:
+            scale = scale[:, remainder > torch.finfo(table.dtype).eps ** 0.5]
+        triangle = torch.linalg.qr(table @ scale, mode="r").R
+        remainder = triangle.diagonal().abs()
+    signs = torch.diag(triangle.diagonal().sign())
+    return scale @ torch.linalg.solve_triangular(triangle, signs, upper=True)
+
+
 # (table (n, L), column norms before the constraints (L,), truncation) -> W (L, L') that conditions table @ W
 CONDITIONINGS: dict[str, Callable[[Tensor, Tensor, float], Tensor]] = {
     "none": _identity,
     "columns": _columns,
     "orthonormal": _orthonormal,
+    "ordered": _ordered,
 }
 
 
@@ -58,13 +71,14 @@ class ConstrainedExpression(nn.Module):
     Shapes: over one variable, β (..., L', d) and κ (..., n_constraints, d) for d components that share the
     tables; over n_variables > 1, β (..., L', n_variables) and κ (..., n_constraints).
 
-    conditioning replaces the free functions by fixed combinations of them, computed once on `nodes`:
-    "columns" divides each by the quadrature RMS of its derivative of the given order (the highest one in the
-    residual); "orthonormal" makes these derivatives orthonormal. Both drop functions that the constraints
-    reduce to round-off, the second also dependent ones (singular values below `truncation`, relative), so
-    L' <= L. Where the constraints leave functions whose derivative of that order is zero, the norm contains
-    the value too. Over several variables it is the norm of the functions before the constraints. Constraints
-    hold to round-off in the weights of the original functions, W β.
+    conditioning replaces the free functions by fixed combinations W of them, computed once on `nodes` from their
+    derivatives of the given order (the highest one in the residual), in quadrature RMS: "columns" divides each by its
+    norm; "orthonormal" makes them orthonormal; "ordered" does that in Gram-Schmidt order, which keeps a narrow function
+    behind wide ones. All drop functions that the constraints reduce to round-off; "orthonormal" also combinations with
+    singular values below `truncation`, relative, and "ordered" functions that those before them span to half the
+    digits; so L' <= L. Where the constraints leave functions whose derivative of that order is zero, the norm contains
+    the value too. Over several variables it is the norm of the functions before the constraints. Constraints hold to
+    round-off in the weights of the original functions, W β. With `combinations` W is given (it was computed before).
 
     A polynomial basis should leave out what the supports span: Chebyshev(L, lowest_degree=n_constraints).
 
@@ -84,6 +98,7 @@ class ConstrainedExpression(nn.Module):
         order: int = 0,
         conditioning: str = "none",
         truncation: float = 1e-12,
+        combinations: Tensor | None = None,
         dtype: torch.dtype = torch.float64,
         device: torch.device | str = "cpu",
     ) -> None:
@@ -101,10 +116,12 @@ class ConstrainedExpression(nn.Module):
         )
         self.register_buffer("combinations", torch.eye(basis.size, dtype=dtype, device=device))
         self.register_buffer("functionals", functionals)
-        if nodes is not None:
+        if combinations is None and nodes is not None:
             table, magnitude = self._table_to_condition(nodes, order)
-            self.combinations = CONDITIONINGS[conditioning](table, magnitude, truncation)
-            self.functionals = functionals @ self.combinations
+            combinations = CONDITIONINGS[conditioning](table, magnitude, truncation)
+        if combinations is not None:
+            self.combinations = combinations
+            self.functionals = functionals @ combinations
 
     @property
     def size(self) -> int:

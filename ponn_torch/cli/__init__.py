@@ -1,9 +1,9 @@
 """``ponn`` and ``ponn-rhc``: from a line of settings to a run folder with a certified solution, or a flight.
 
-Exit codes: 0 the run did what was asked (certified; or, with ``refinement=none``, a solution, whatever its
-certificate says), 1 bad input, 2 no certified solution, 3 an error inside, 130 interrupted. A sweep (``-m``)
-runs all its members and ends with the largest code among them; what it optimises is the cost of a certified
-solution, else infinity.
+Exit codes: 0 the run did what was asked (certified; or, where the refinement claims no certificate, a solution,
+whatever its certificate says), 1 bad input, 2 no certified solution, 3 an error inside, 130 interrupted. A sweep
+(``-m``) runs all its members and ends with the largest code among them; what it optimises is the cost of a
+certified solution, else infinity.
 """
 
 from __future__ import annotations

@@ -150,7 +150,7 @@ class SolveJob:
         with recorder:
             result = plan.solver.solve(plan.problem, plan.seed, recorder, journal)
         code = DONE if result.certified else NOT_CERTIFIED
-        if plan.solver.refinement is None and result.solution is not None and result.certificate is not None:
+        if not plan.solver.exact and result.solution is not None and result.certificate is not None:
             code = DONE  # a smoothed solution was asked for; what it is worth stands in its certificate
         if result.interrupted:
             code = INTERRUPTED

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,15 +20,29 @@ class NodeSet:
     """Points on [-1, 1] and the weights that integrate over it.
 
     points: (n,), ascending. weights: (n,), positive, summing to 2, exact up to the degree that `make_nodes`
-    states.
+    states. edges: (P+1,), between which the rule is repeated; None for one panel.
     """
 
     kind: str
     points: Tensor
     weights: Tensor
+    edges: Tensor | None = None
 
     def __len__(self) -> int:
         return self.points.shape[0]
+
+    def between(self, n_points: int) -> Tensor:
+        """About n_points off the nodes, ascending: even in every panel, as many as its share of the nodes asks for."""
+        edges = self.points.new_tensor([-1.0, 1.0]) if self.edges is None else self.edges
+        panels = torch.bucketize(self.points, edges[1:-1].contiguous())
+        counts = torch.bincount(panels, minlength=len(edges) - 1)
+        parts = []
+        for start, end, count in zip(edges[:-1].tolist(), edges[1:].tolist(), counts.tolist(), strict=True):
+            n = n_points if self.edges is None else max(2, math.ceil(n_points * count / len(self)))
+            step = (end - start) / n
+            grid = torch.linspace(start + step / 2, end - step / 2, n, dtype=edges.dtype, device=edges.device)
+            parts.append(grid)
+        return torch.cat(parts)
 
 
 def _trapezoid(n: int) -> tuple[Array, Array]:
@@ -125,6 +140,44 @@ def make_nodes(
         raise ValueError(f"n_nodes = {n_nodes} is too few for {kind} nodes; allowed: at least {fewest}")
     points, weights = (torch.as_tensor(a, dtype=dtype, device=device) for a in rule(n_nodes))
     return NodeSet(kind, points, weights)
+
+
+def make_panels(kind: str, edges: Tensor, counts: int | Sequence[int]) -> NodeSet:
+    """A rule of a named kind on every panel between ``edges`` (P+1,), which ascend from −1 to 1.
+
+    Raises ValueError for other edges, and as `make_nodes` does; panels of a kind with both ends share theirs twice.
+    """
+    lengths = edges.diff()
+    if not (float(edges[0]) == -1.0 and float(edges[-1]) == 1.0 and bool((lengths > 0).all())):
+        raise ValueError(f"edges = {edges.tolist()}; allowed: ascending from -1 to 1")
+    counts = [counts] * len(lengths) if isinstance(counts, int) else counts
+    if len(counts) != len(lengths):
+        raise ValueError(f"counts has {len(counts)} entries for {len(lengths)} panels; allowed: one per panel")
+    rules = {n: make_nodes(kind, n, dtype=edges.dtype, device=edges.device) for n in set(counts)}
+    points, weights = [], []
+    for start, length, count in zip(edges[:-1], lengths, counts, strict=True):
+        points.append(start + length * (rules[count].points + 1) / 2)
+        weights.append(rules[count].weights * length / 2)
+    return NodeSet(kind, torch.cat(points), torch.cat(weights), edges)
+
+
+def graded_edges(centres: Tensor, widths: Tensor, coarsest: float = 0.5) -> Tensor:
+    """Edges (P+1,) on [−1, 1] of panels that resolve layers of the given widths (M,) at the centres (M,).
+
+    By halving: next to a layer no panel is longer than its width, elsewhere none than its distance from it.
+
+    Raises ValueError for a width that is not positive.
+    """
+    if not bool((widths > 0).all()):
+        raise ValueError(f"widths = {widths.tolist()}; allowed: positive numbers")
+    edges = torch.linspace(-1.0, 1.0, math.ceil(2 / coarsest) + 1, dtype=centres.dtype, device=centres.device)
+    while True:
+        start, end = edges[:-1, None], edges[1:, None]
+        distance = torch.maximum(start - centres, centres - end).clamp_min(0.0)
+        long = (end - start > torch.maximum(widths, distance)).any(-1)
+        if not bool(long.any()):
+            return edges
+        edges = torch.cat([edges, ((edges[:-1] + edges[1:]) / 2)[long]]).sort().values
 
 
 def barycentric_weights(points: Tensor) -> Tensor:

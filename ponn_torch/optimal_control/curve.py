@@ -88,15 +88,18 @@ class Curve:
         return Setting(regime, {k: v * one for k, v in setting.parameters.items()})
 
     def defect(self, n_points: int = 200) -> tuple[Tensor, Tensor]:
-        """ẇ − F at scaled times off the nodes: (t (K·n,), (K·n, 2n)), on an even grid inside every segment."""
-        step = 2.0 / n_points
-        z = torch.linspace(-1 + step / 2, 1 - step / 2, n_points, dtype=self.xi.dtype, device=self.xi.device)
-        t, w, rate, segment = self.on_segments(z)
+        """ẇ − F at scaled times off the nodes, about n_points a segment: (t (K·n,), (K·n, 2n))."""
+        t, w, rate, segment = self.on_segments(self.collocation.discretisation.nodes.between(n_points))
         return t, rate - self.collocation.bvp.rates(t[:, None], w, self.setting(segment))
 
     def off_node_residuals(self, n_points: int = 50) -> Tensor:
         """Largest |ẇ − F| off the nodes of every segment (K,), in scaled units."""
-        return self.defect(n_points)[1].abs().amax(-1).view(-1, n_points).amax(-1)
+        return self.defect(n_points)[1].abs().amax(-1).view(self.collocation.n_segments, -1).amax(-1)
+
+    @property
+    def largest_rate(self) -> float:
+        """Largest |ẇ| at the nodes, in scaled units: what an off-node residual is held against."""
+        return float(self.on_segments(self.collocation.discretisation.nodes.points)[2].abs().max())
 
     def off_node_residual(self, n_points: int = 200) -> float:
         """Largest |ẇ − F| off the nodes, in scaled units."""

@@ -6,7 +6,7 @@ value problem, whatever its segments.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 
@@ -81,13 +81,18 @@ class Group:
 
 @dataclass(frozen=True, eq=False)
 class Discretisation:
-    """Basis, nodes and form, tabulated for the chains of a boundary value problem; shared by all its residuals."""
+    """Basis, nodes and form, tabulated for the chains of a boundary value problem; shared by all its residuals.
+
+    combinations: of the basis by chain order, where the conditioning that made them is not to be done again (on another
+    machine its singular vectors may differ).
+    """
 
     bvp: BoundaryValueProblem
     basis: FreeFunction
     nodes: NodeSet
     form: Form = field(default_factory=Strong)
     conditioning: str = "orthonormal"
+    combinations: Mapping[int, Tensor] = field(default_factory=dict)
 
     @cached_property
     def groups(self) -> tuple[Group, ...]:

@@ -86,6 +86,7 @@ class LinearExpressions:
                 nodes=self.nodes,
                 order=group.order,
                 conditioning=discretisation.conditioning,
+                combinations=discretisation.combinations.get(group.order),
                 dtype=self.nodes.points.dtype,
                 device=self.nodes.points.device,
             )
@@ -99,6 +100,11 @@ class LinearExpressions:
     @property
     def n_own(self) -> int:
         return self.tables[-1].own.stop
+
+    @property
+    def combinations(self) -> dict[int, Tensor]:
+        """The combinations of the basis that β belongs to, by chain order."""
+        return {group.order: t.expression.combinations for group, t in zip(self.groups, self.tables, strict=True)}
 
     def beta(self, group: int, weights: Tensor) -> Tensor:
         """β (..., d, L) of a group's chains, a view of weights (..., n_own)."""

@@ -114,7 +114,8 @@ def check_final_time(problem: OptimalControlProblem, solver: Solver, seed: int =
     """
     if problem.free_final_time or not isinstance(problem.control, Bounded):
         return None
-    refinement = solver.refinement if solver.refinement is not None and solver.refinement.reads_arcs else Split()
+    given = solver.refinement
+    refinement = given if given is not None and given.exact and given.reads_arcs else Split()
     twin = replace(solver, refinement=refinement, n_certified=1)
     result = twin.solve(minimum_time_twin(problem), seed)
     certified = result.solution if result.certified else None

@@ -44,20 +44,26 @@ class Outcome(Enum):
 
 @dataclass(frozen=True)
 class Refined:
-    """The last curve, how the refinement ended, every round's optimiser result, and what more there is to say."""
+    """The curve, how it ended, every round's optimiser result, what more there is to say, and what made the curve."""
 
     curve: Curve
     outcome: Outcome
     rounds: list[OptimizeResult]
     note: str = ""
+    made_by: OptimizeResult | None = None  # None: the last round
 
     @property
     def message(self) -> str:
         return self.outcome.value + self.note
 
+    @property
+    def result(self) -> OptimizeResult:
+        return self.made_by or self.rounds[-1]
+
 
 class Refinement(Protocol):
     reads_arcs: ClassVar[bool]  # whether the arcs of the curve it starts from matter
+    exact: ClassVar[bool]  # whether what it solves is meant to be certified, or only sharper than before
 
     def run(self, start: Curve, callback: MakeCallback | None = None) -> Refined:
         """Refine a curve; never raises for want of convergence, the outcome says how it ended."""
@@ -66,7 +72,7 @@ class Refinement(Protocol):
 
 @dataclass(frozen=True)
 class Segmentation:
-    """What refinements share: small segments of one size, and the solver of a round.
+    """What refinements on segments share: their size, and the solver of a round.
 
     Small blocks are what makes it fast: the arrow elimination costs n_segments × n_neurons³.
 
@@ -76,6 +82,8 @@ class Segmentation:
         residual_tolerance: ‖r‖ above which a round has failed.
         off_node_tolerance: largest |ẇ − F| off the nodes, scaled, weighted by the segment's share of the time.
     """
+
+    exact: ClassVar[bool] = True
 
     n_neurons: int = 14
     n_nodes: int = 20

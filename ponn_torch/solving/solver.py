@@ -117,6 +117,11 @@ class Solver:
         if not self.cpu_seconds > 0:
             raise ValueError(f"cpu_seconds = {self.cpu_seconds}; allowed: a positive number")
 
+    @property
+    def exact(self) -> bool:
+        """Whether the result is meant to be certified; a smoothed one shows in its certificate what it is worth."""
+        return self.refinement is not None and self.refinement.exact
+
     def solve(
         self,
         problem: OptimalControlProblem,
@@ -226,8 +231,8 @@ class _Run:
                 n_certified += judged.certified
                 if best is None or _better(judged, best[1]):
                     best, message = (candidate, judged), note or judged.verdict
-                # unrefined, a start that came through its stages is the answer, certified or not
-                enough = 1 if self.solver.refinement is None else n_certified
+                # a start that came through its stages is the answer where nothing aims at a certificate
+                enough = n_certified if self.solver.exact else 1
                 if enough >= self.solver.n_certified or self.clock.spent:
                     break
         except (_Interrupted, KeyboardInterrupt):
@@ -348,28 +353,26 @@ class _Run:
             return True
         if not isinstance(solution.curve.collocation.discretisation.form, Strong):
             return True
-        curve, points = solution.curve, solution.curve.collocation.discretisation.nodes.points
-        largest = float(curve.on_segments(points)[2].abs().max())
-        return solution.off_node_residual <= self.solver.trust * largest
+        return solution.off_node_residual <= self.solver.trust * solution.curve.largest_rate
 
     # -- refinement ---------------------------------------------------------------------------------------------------
 
     def _refined(self, smoothed: Solution) -> tuple[Solution, str]:
-        """The refined solution where the refinement succeeds, else the smoothed one and why."""
+        """The refined solution where the refinement succeeds or improves, else the smoothed one and why."""
         refinement = self.solver.refinement
         if refinement is None:
             return smoothed, ""
         name = type(refinement).__name__.lower()
         self.observer.stage_started(name, None, len(self.stages))
         refined = refinement.run(smoothed.curve, self._callback)
-        if not refined.rounds:
-            return smoothed, refined.message
-        for result in refined.rounds[:-1]:
-            self._stage(name, None, result, float("nan"), float("nan"), None)
-        solution = self._record(name, refined.curve, refined.rounds[-1])
+        improved = refined.curve is not smoothed.curve
+        for result in refined.rounds:
+            if not improved or result is not refined.result:
+                self._stage(name, None, result, float("nan"), float("nan"), None)
+        solution = self._record(name, refined.curve, refined.result) if improved else smoothed
         if refined.outcome is refinements.Outcome.INTERRUPTED and not self.clock.spent:
             raise _Interrupted
-        if refined.outcome is refinements.Outcome.SOLVED:
+        if refined.outcome is refinements.Outcome.SOLVED or (improved and not refinement.exact):
             return solution, ""
         return smoothed, f"{name}: {refined.message}"
 

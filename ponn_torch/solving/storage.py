@@ -19,6 +19,7 @@ from ponn_torch.optimal_control.collocation import Collocation
 from ponn_torch.optimal_control.control_laws import Regime
 from ponn_torch.optimal_control.curve import Curve
 from ponn_torch.optimal_control.discretisation import Discretisation, Form, Strong, Weak
+from ponn_torch.optimal_control.expressions import LinearExpressions
 from ponn_torch.optimal_control.pontryagin import Chain, Setting, pontryagin
 from ponn_torch.optimal_control.problem import OptimalControlProblem, nearest
 from ponn_torch.optimal_control.references import load_problem, relative_reference, resolved_reference
@@ -39,11 +40,13 @@ def save_curve(curve: Curve, folder: Path) -> None:
         "known_times": collocation.known_times,
         "node_points": disc.nodes.points,
         "node_weights": disc.nodes.weights,
+        "node_edges": disc.nodes.edges,
         "arcs": setting.regime.arcs,
         "smoothing": setting.regime.smoothing,
         **{f"check/{name}": value for name, value in _fingerprint(curve).items()},
         **{f"parameter/{name}": value for name, value in setting.parameters.items()},
         **{f"basis/{name}": value for name, value in disc.basis.state_dict().items()},
+        **{f"combinations/{order}": value for order, value in _combinations(disc).items()},
     }
     description = {
         "format": FORMAT,
@@ -102,9 +105,12 @@ def load_curve(folder: Path, problem: OptimalControlProblem | None = None) -> Cu
     discretisation = Discretisation(
         bvp=replace(bvp, chains=chains),
         basis=_make_basis(description["basis"], _under("basis", arrays), xi.dtype),
-        nodes=NodeSet(description["nodes"]["kind"], arrays["node_points"], arrays["node_weights"]),
+        nodes=NodeSet(
+            description["nodes"]["kind"], arrays["node_points"], arrays["node_weights"], arrays.get("node_edges")
+        ),
         form=FORMS[form["class"]](**form["arguments"]),
         conditioning=description["conditioning"],
+        combinations={int(order): value for order, value in _under("combinations", arrays).items()},
     )
     collocation = Collocation(
         discretisation=discretisation,
@@ -134,19 +140,32 @@ def _make_problem(saved: dict[str, Any], folder: Path) -> OptimalControlProblem:
     return load_problem(resolved_reference(saved["reference"], folder), **saved["arguments"])
 
 
+def _combinations(disc: Discretisation) -> dict[int, Tensor]:
+    """What conditioning made of a linear basis: made anew on another machine, its singular vectors may differ."""
+    return disc.expressions.combinations if isinstance(disc.expressions, LinearExpressions) else {}
+
+
 def _describe_basis(basis: FreeFunction) -> dict[str, Any]:
-    """Class path and arguments."""
-    return {"class": f"{type(basis).__module__}:{type(basis).__qualname__}", "arguments": basis.arguments}
+    """Class path and arguments, a basis inside a basis likewise."""
+    arguments = {k: _describe_basis(v) if isinstance(v, FreeFunction) else v for k, v in basis.arguments.items()}
+    return {"class": f"{type(basis).__module__}:{type(basis).__qualname__}", "arguments": arguments}
 
 
 def _make_basis(saved: dict[str, Any], buffers: dict[str, Tensor], dtype: torch.dtype) -> FreeFunction:
+    basis = _empty_basis(saved).to(dtype)
+    basis.load_state_dict(buffers)
+    return basis
+
+
+def _empty_basis(saved: dict[str, Any]) -> FreeFunction:
+    """A basis up to its buffers."""
     module, _, name = saved["class"].partition(":")
     cls = getattr(importlib.import_module(module), name, None)
     if not (isinstance(cls, type) and issubclass(cls, FreeFunction)):
         raise ValueError(f"basis class = {saved['class']!r}; allowed: subclasses of FreeFunction")
-    basis = cls(**saved["arguments"]).to(dtype)
-    basis.load_state_dict(buffers)
-    return basis
+    arguments = saved["arguments"]
+    inner = {k: _empty_basis(v) for k, v in arguments.items() if isinstance(v, dict) and "class" in v}
+    return cls(**arguments | inner)
 
 
 def _fingerprint(curve: Curve) -> dict[str, Tensor]:

@@ -10,7 +10,8 @@ from hypothesis import strategies as st
 from ponn_torch.ansatz.basis import Chebyshev, GaussianRBF, Legendre, RandomFeatures
 from ponn_torch.ansatz.constraints import derivative, hermite, integral, value
 from ponn_torch.ansatz.expression import CONDITIONINGS, ConstrainedExpression
-from ponn_torch.numerics.nodes import make_nodes
+from ponn_torch.ansatz.switch_neurons import SwitchNeuronBasis
+from ponn_torch.numerics.nodes import make_nodes, make_panels
 
 NODES = make_nodes("legendre_gauss", 60)
 FINE = torch.linspace(-1, 1, 301, dtype=torch.float64)
@@ -240,7 +241,7 @@ def test_columns_have_unit_rms_of_the_highest_derivative():
     assert (scaled[2, -1] * raw[2, -1] > 0).all()
 
 
-@pytest.mark.parametrize("conditioning", ["columns", "orthonormal"])
+@pytest.mark.parametrize("conditioning", ["columns", "orthonormal", "ordered"])
 def test_functions_that_the_supports_span_are_dropped(conditioning):
     expression = ConstrainedExpression(Chebyshev(10), hermite(2), nodes=NODES, order=2, conditioning=conditioning)
     assert expression.size == 6
@@ -298,6 +299,33 @@ def test_a_fit_on_other_nodes_than_the_conditioning_agrees():
         weights = expression.fit(FINE, values, kappa)
         curves.append(expression.jet(weights, kappa, torch.tensor([-0.777, 0.123], dtype=torch.float64), 2))
     torch.testing.assert_close(curves[0], curves[1], rtol=1e-9, atol=1e-9)
+
+
+def test_in_order_a_narrow_function_is_kept_behind_wide_ones():
+    """Two layers of unlike width differ by less than 1e-6 of the largest polynomial; two of the same are one."""
+    nodes = make_panels("legendre_gauss", torch.linspace(-1, 1, 41, dtype=torch.float64), 8)
+    basis = SwitchNeuronBasis(Chebyshev(40, lowest_degree=4), [0.2] * 3, [1e3, 1.5e3, 1.5e3], [0, 0, 0])
+    made = {
+        conditioning: ConstrainedExpression(
+            basis, hermite(2), nodes=nodes, order=2, conditioning=conditioning, truncation=1e-6
+        )
+        for conditioning in ("orthonormal", "ordered")
+    }
+    assert made["orthonormal"].size < made["ordered"].size == basis.size - 1
+    table = (nodes.weights / 2).sqrt()[:, None] * made["ordered"].tables(nodes.points, 2)[0][2]
+    torch.testing.assert_close(table.T @ table, torch.eye(table.shape[1], dtype=table.dtype), rtol=0, atol=1e-9)
+
+
+def test_given_combinations_are_used_as_they_are():
+    basis = RandomFeatures(40, "tanh", seed=4)
+    first = ConstrainedExpression(basis, hermite(2), nodes=NODES, order=2, conditioning="orthonormal")
+    flipped = first.combinations * torch.linspace(-1, 1, first.size, dtype=torch.float64).sign()
+    second = ConstrainedExpression(
+        basis, hermite(2), nodes=NODES, order=2, conditioning="orthonormal", combinations=flipped
+    )
+    for one, other in zip(first.tables(NODES.points, 2), second.tables(NODES.points, 2), strict=True):
+        torch.testing.assert_close(one.abs(), other.abs(), rtol=0, atol=1e-8 * float(one.abs().max()))
+    assert torch.equal(second.combinations, flipped)
 
 
 def test_a_state_dict_restores_the_expression_in_full():

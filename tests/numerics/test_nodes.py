@@ -1,6 +1,7 @@
 """Nodes: exact quadrature to the documented degree, end points, interpolation, differentiation, moments."""
 
 import math
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -11,9 +12,11 @@ from ponn_torch.numerics.nodes import (
     NodeSet,
     barycentric_weights,
     differentiation_matrix,
+    graded_edges,
     interpolation_matrix,
     legendre_moments,
     make_nodes,
+    make_panels,
 )
 
 EXACT_DEGREE = {
@@ -153,6 +156,53 @@ def test_moments_of_orthonormal_legendre_polynomials(kind):
     np.testing.assert_allclose(moments.numpy() @ values, np.eye(12), atol=1e-14)
     with pytest.raises(ValueError, match="n_moments = 0"):
         legendre_moments(nodes, 0)
+
+
+def test_panels_integrate_by_parts():
+    edges = torch.tensor([-1.0, -0.2, -0.19, 1.0], dtype=torch.float64)
+    nodes = make_panels("legendre_gauss", edges, [3, 5, 4])
+    assert len(nodes) == 12
+    assert bool((nodes.points.diff() > 0).all())
+    for degree in range(6):
+        exact = (1 - (-1) ** (degree + 1)) / (degree + 1)
+        assert float(nodes.weights @ nodes.points**degree) == pytest.approx(exact, abs=1e-15)
+
+
+def test_points_between_are_even_in_every_panel():
+    plain = make_nodes("legendre_gauss", 7).between(4)
+    assert plain.tolist() == pytest.approx([-0.75, -0.25, 0.25, 0.75])
+    edges = torch.tensor([-1.0, 0.0, 0.01, 1.0], dtype=torch.float64)
+    between = make_panels("legendre_gauss", edges, [4, 8, 4]).between(16)
+    counts = [int(((between > low) & (between < high)).sum()) for low, high in pairwise(edges.tolist())]
+    assert counts == [4, 8, 4]
+    assert bool((between.diff() > 0).all())
+
+
+@pytest.mark.parametrize(
+    ("edges", "counts", "message"),
+    [
+        ([-1.0, 0.5], 4, "ascending from -1 to 1"),
+        ([-1.0, 0.5, 0.5, 1.0], 4, "ascending from -1 to 1"),
+        ([-1.0, 0.0, 1.0], [4], "counts has 1 entries for 2 panels"),
+    ],
+)
+def test_wrong_panels_are_errors(edges, counts, message):
+    with pytest.raises(ValueError, match=message):
+        make_panels("legendre_gauss", torch.tensor(edges, dtype=torch.float64), counts)
+
+
+def test_graded_panels_resolve_layers_and_widen_away_from_them():
+    centres, widths = torch.tensor([-0.3, 0.61, 1.0]), torch.tensor([1e-6, 1e-3, 0.1])
+    edges = graded_edges(centres, widths, coarsest=0.5)
+    for low, high in pairwise(edges.tolist()):
+        for centre, width in zip(centres.tolist(), widths.tolist(), strict=True):
+            distance = max(low - centre, centre - high, 0.0)
+            assert high - low <= 1.0001 * max(width, distance)
+    assert edges.diff().max() <= 0.5
+    assert len(edges) < 120  # by halving: about two panels for every power of two
+    assert len(graded_edges(centres[:0], widths[:0])) == 5
+    with pytest.raises(ValueError, match="widths"):
+        graded_edges(centres, -widths)
 
 
 def test_a_node_set_is_frozen():

@@ -17,6 +17,7 @@ from helpers import random
 
 from ponn_torch.ansatz.basis import Chebyshev, GaussianRBF, Legendre, RandomFeatures
 from ponn_torch.ansatz.networks import MLP, FrozenMLP
+from ponn_torch.ansatz.switch_neurons import SwitchNeuronBasis
 from ponn_torch.optimal_control.control_laws import REGULARISERS, Regime, make_regulariser
 from ponn_torch.optimal_control.curve import Curve
 from ponn_torch.optimal_control.problem import ProblemOrigin
@@ -181,6 +182,7 @@ BASES = {
     "rbf": (GaussianRBF(9, 1.7), "none"),
     "mlp": (MLP((6, 9)), "none"),
     "frozen_mlp": (FrozenMLP((6, 9), seed=5), "orthonormal"),
+    "switch_neurons": (SwitchNeuronBasis(RandomFeatures(12, "tanh"), [0.3], [40.0], [1]), "ordered"),
 }
 
 
