@@ -1,0 +1,58 @@
+"""The rows of the study: free functions of comparable size, and what solves for them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+from ponn_torch.ansatz.basis import Chebyshev, FreeFunction, RandomFeatures
+from ponn_torch.ansatz.networks import MLP, FrozenMLP
+from ponn_torch.optim.base import Optimizer, Stopping
+from ponn_torch.optim.chain import Chain, OutputLayer
+from ponn_torch.optim.gradient import Adam
+from ponn_torch.optim.least_squares import GaussNewton, LevenbergMarquardt
+from ponn_torch.optim.quasi_newton import LBFGS, SSBroyden
+
+BUDGET = 8.0  # CPU seconds of an iteration over all weights; none was chosen by looking at an error
+
+LINEAR = LevenbergMarquardt(Stopping(tolerance=1e-13, decrease=1e-2, patience=3), linear_solver="qr")
+LM_OUTPUT = Chain(
+    [
+        LevenbergMarquardt(
+            Stopping(tolerance=1e-10, decrease=1e-2, patience=8, max_iterations=100, cpu_seconds=BUDGET),
+            geodesic=True,
+        ),
+        OutputLayer(GaussNewton()),
+    ]
+)
+
+
+# Adam's schedule needs its number of steps beforehand: about as many as fit into the budget
+_STOPPING = Stopping(tolerance=1e-10, decrease=0.0, max_iterations=10**6, cpu_seconds=BUDGET)
+FIRST_ORDER: dict[str, Optimizer] = {
+    "Adam": Adam(stopping=replace(_STOPPING, max_iterations=300)),
+    "L-BFGS": LBFGS(stopping=_STOPPING),
+    "SSBroyden": SSBroyden(stopping=_STOPPING),
+}
+
+
+@dataclass(frozen=True)
+class Method:
+    """One row: a free function for a seed, how its table is conditioned, and its optimiser."""
+
+    name: str
+    free_function: Callable[[int], FreeFunction]
+    optimizer: Optimizer
+    conditioning: str = "columns"
+    seeded: bool = True
+
+    def seeds(self, seeds: range) -> range:
+        """One run of what no seed changes."""
+        return seeds if self.seeded else seeds[:1]
+
+
+HIDDEN = (20, 40)
+CHEBYSHEV = Method("Chebyshev, L = 60", lambda seed: Chebyshev(60), LINEAR, seeded=False)
+ELM = Method("ELM tanh, L = 60", lambda seed: RandomFeatures(60, "tanh", seed=seed), LINEAR)
+MLP_LM = Method("MLP 20-40, LM → output layer", lambda seed: MLP(HIDDEN, seed=seed), LM_OUTPUT)
+FROZEN = Method("the same, hidden layers untrained", lambda seed: FrozenMLP(HIDDEN, seed=seed), LINEAR)
