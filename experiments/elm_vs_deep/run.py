@@ -13,7 +13,13 @@ from experiments.elm_vs_deep import arcs, landing, layers, transfer
 from experiments.tables import run_study
 
 FOLDER = Path(__file__).parent
-PARTS = {"transfer": transfer.run, "layers": layers.run, "landing": landing.run, "arcs": arcs.run}
+PARTS = {
+    "transfer": transfer.run,
+    "networks": transfer.run_others,
+    "layers": layers.run,
+    "landing": landing.run,
+    "arcs": arcs.run,
+}
 
 
 def main() -> int:

@@ -29,7 +29,7 @@ TRAINED = [
     Method(f"MLP 20-40, {name}", lambda seed: MLP(HIDDEN, seed=seed), optimizer)
     for name, optimizer in FIRST_ORDER.items()
 ]
-METHODS = [CHEBYSHEV, ELM, FROZEN, MLP_LM, *OTHERS, *TRAINED]
+METHODS = [CHEBYSHEV, ELM, FROZEN, MLP_LM]
 
 
 def truth(bvp: BoundaryValueProblem, guess: ScaledCurve) -> Curve:
@@ -44,20 +44,33 @@ def truth(bvp: BoundaryValueProblem, guess: ScaledCurve) -> Curve:
     return curve
 
 
-def run(seeds: range) -> Report:
+def _rows(methods: list[Method], seeds: range) -> list[Row]:
     bvp = pontryagin(energy_transfer())
     guess = PolarTransfer().curve(bvp, 0)
     reference = truth(bvp, guess)
     known = bvp.problem.known_cost or float("nan")
     rows: list[Row] = []
-    for method in METHODS:
+    for method in methods:
         for seed in method.seeds(seeds):
             row = single.run(bvp, method, seed, 60 if method is not CHEBYSHEV else 90, guess, reference)
             row["known_extremal"] = abs(row["cost"] / known - 1) < 1e-3
             rows.append(row)
             print(f"transfer {method.name} seed {seed}: {row['state_error']:.1e} {row['cpu_s']:.1f} s", flush=True)
+    return rows
+
+
+def _summary(rows: list[Row], seeds: range) -> str:
     table = single.lines(rows, lambda mine: {"known extremal": share(row["known_extremal"] for row in mine)})
-    text = f"Seeds {seeds[0]}–{seeds[-1]}; median [min, max].\n\n{markdown(table)}"
+    return f"Seeds {seeds[0]}–{seeds[-1]}; median [min, max].\n\n{markdown(table)}"
+
+
+def run_others(seeds: range) -> Report:
+    rows = _rows([*OTHERS, *TRAINED], seeds)
+    return Report({"networks": rows}, _summary(rows, seeds))
+
+
+def run(seeds: range) -> Report:
+    rows = _rows(METHODS, seeds)
     deep = [row for row in rows if row["method"] == MLP_LM.name]
     linear = [row for row in rows if row["method"] == CHEBYSHEV.name]
     measured = {
@@ -68,4 +81,4 @@ def run(seeds: range) -> Report:
         "transfer/Chebyshev costates": worst(row["costate_error"] for row in linear),
         "transfer/Chebyshev CPU s": worst(row["cpu_s"] for row in linear),
     }
-    return Report({"transfer": rows}, text, measured)
+    return Report({"transfer": rows}, _summary(rows, seeds), measured)
