@@ -63,7 +63,7 @@ METHODS = [
     Way("MLP 20-40, weak", _mlp, DEEP, Weak(1.0)),
     Way("the same, hidden layers untrained, weak", _frozen, form=Weak(1.0)),
     Way(
-        "Chebyshev down to ρ = 0.03, then halved segments",
+        "Chebyshev, L = 30, then halved segments",
         lambda seed: Chebyshev(30),
         conditioning="columns",
         refinement=Subdivide(),
