@@ -79,6 +79,8 @@ def pointwise_jacobian(
     with torch.enable_grad():
         inputs = [x.detach().repeat(count, 1).requires_grad_() for x in arguments]
         value = function(*inputs, *fixed)
+        if not value.requires_grad:  # F does not depend on its arguments at all
+            return value[:n], tuple(x.new_zeros(n, count, x.shape[-1]) for x in arguments)
         seeds = torch.zeros_like(value).view(count, n, -1)
         seeds[range(count), :, list(rows)] = 1.0
         pulled = torch.autograd.grad(value, inputs, seeds.view_as(value), materialize_grads=True)
@@ -93,6 +95,8 @@ def row_gradients(function: Callable[..., Tensor], *arguments: Tensor) -> tuple[
     with torch.enable_grad():
         inputs = [x.detach().requires_grad_() for x in arguments]
         value = function(*inputs)
+        if not value.requires_grad:
+            return value, tuple(x.new_zeros(value.shape[-1], *x.shape) for x in arguments)
         rows = [
             torch.autograd.grad(row.sum(), inputs, retain_graph=True, materialize_grads=True)
             for row in value.unbind(-1)

@@ -81,6 +81,16 @@ def test_the_jacobian_of_a_pointwise_function_is_that_of_torch_func_in_and_outsi
     assert empty.shape == (5, 0, 2)
 
 
+def test_a_function_of_nothing_has_zero_slopes():
+    x, y = sample()
+    value, slopes = pointwise_jacobian(lambda x, y: torch.ones_like(x), [0, 1], x, y)
+    assert torch.equal(value, torch.ones_like(x))
+    assert all(torch.equal(found, x.new_zeros(5, 2, 2)) for found in slopes)
+    row, slopes = row_gradients(lambda x: torch.ones_like(x[..., :1]), x)
+    assert torch.equal(row, x.new_ones(5, 1))
+    assert torch.equal(slopes[0], x.new_zeros(1, 5, 2))
+
+
 def test_row_gradients_are_the_rows_of_the_jacobian_for_every_member_of_a_batch():
     x, y = sample(n=3)
 

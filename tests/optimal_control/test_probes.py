@@ -36,9 +36,7 @@ def test_a_control_saturated_at_all_probes_is_still_seen(regulariser):
     cost = lambda t, x, u, p: u.u  # noqa: E731
     bvp = pontryagin(cart(control=Box("u", 100.0, 0.0, regulariser), running_cost=cost))
     assert {c.columns: c.trivial for c in bvp.chains} == {(0, 1): False, (3, 2): True}
-    nodes = torch.zeros(0)  # couplings need neither nodes nor a basis
-    couplings = Discretisation(bvp, None, nodes).couplings
-    assert couplings[1].tolist() == [False, False, False, True]
+    assert bvp.couplings[1].tolist() == [False, False, False, True]
 
 
 def test_a_box_refuses_a_hamiltonian_affine_in_one_component_and_convex_in_another():
