@@ -80,7 +80,7 @@ def descents(count: int, margins: Sequence[float]) -> Report:
                 }
             )
             print(lines[-1], flush=True)
-            measured[f"{start} {margin:g} landed share"] = float(landed.double().mean())
+            measured[f"descents/{start} {margin:g} landed share"] = float(landed.double().mean())
     return Report({"landers": rows}, markdown(lines), measured)
 
 

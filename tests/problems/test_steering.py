@@ -95,7 +95,7 @@ def largest_orbit(thrust: float, mass_flow: float, final_time: float) -> tuple[f
     return float(end(found.x)[0]), found.x
 
 
-@pytest.mark.parametrize("final_time", [3.3194, 2.8])
+@pytest.mark.parametrize("final_time", [3.3194, pytest.param(2.8, marks=pytest.mark.slow)])
 def test_the_largest_orbit_is_that_of_shooting(final_time):
     result = Solver().solve(orbit_raising(final_time=final_time))
     assert result.certified, result.message
