@@ -7,6 +7,7 @@ stays.
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import torch
@@ -32,6 +33,14 @@ class Fleet:
         self.arrival = torch.zeros(count, dtype=torch.float64)
         self._note(range(count))
 
+    def _together(self, members: Sequence[int]) -> Iterator[tuple[list[int], Family]]:
+        """Members whose plans are rows of one family, side by side in it: (who, the family of them)."""
+        groups: dict[int, list[int]] = {}
+        for i in members:
+            groups.setdefault(id(self.plans[i][0]), []).append(i)
+        for who in groups.values():
+            yield who, self.plans[who[0]][0][torch.tensor([self.plans[i][1] for i in who])]
+
     def _note(self, members: range | list[int]) -> None:
         for i in members:
             family, row = self.plans[i]
@@ -44,14 +53,12 @@ class Fleet:
     def plan(self, members: list[int], measured: Tensor, t: float) -> None:
         """New plans for some landers from measured states (B', 7); those that have none keep the last."""
         ahead = self.switches_ahead(t)
-        groups: dict[tuple[int, int], list[int]] = {}
-        for place, i in enumerate(members):
-            groups.setdefault((id(self.plans[i][0]), int(ahead[i])), []).append(place)
-        for (_, left), places in groups.items():
-            who = [members[place] for place in places]
-            family = self.plans[who[0]][0][torch.tensor([self.plans[i][1] for i in who])]
-            start = torch.full((len(who),), t / self.bvp.time_unit, dtype=torch.float64)
-            found, solved = family.restart(measured[places], start, passed=family.n_arcs - 1 - left, how=self.restart)
+        states = dict(zip(members, measured, strict=True))
+        alike = [[i for i in members if ahead[i] == left] for left in ahead[members].unique()]
+        for who, family in [group for some in alike for group in self._together(some)]:
+            start, passed = t / self.bvp.time_unit, family.n_arcs - 1 - int(ahead[who[0]])
+            here = torch.stack([states[i] for i in who])
+            found, solved = family.restart(here, start, passed=passed, how=self.restart)
             for row, i in enumerate(who):
                 if bool(solved[row]):
                     self.plans[i] = (found, row)
@@ -86,10 +93,6 @@ class Fleet:
     def thrust(self, t: Tensor) -> Tensor:
         """Planned thrust (B, m, 3) at times (B, m), N."""
         out = t.new_zeros(*t.shape, 3)
-        groups: dict[int, list[int]] = {}
-        for i, (family, _) in enumerate(self.plans):
-            groups.setdefault(id(family), []).append(i)
-        for who in groups.values():
-            family = self.plans[who[0]][0][torch.tensor([self.plans[i][1] for i in who])]
+        for who, family in self._together(range(len(self.plans))):
             out[who] = family.control(t[who] / self.bvp.time_unit)[self.bvp.law.name]  # type: ignore[attr-defined]
         return out

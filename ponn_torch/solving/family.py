@@ -7,11 +7,12 @@ what a controller solves every cycle from the state it has been flown to, and wh
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import torch
 from torch import Tensor
 
-from ponn_torch.optim.base import Status, Stopping
+from ponn_torch.optim.base import Stopping
 from ponn_torch.optim.least_squares import LevenbergMarquardt
 from ponn_torch.optimal_control.collocation import Collocation, Unknowns
 from ponn_torch.optimal_control.control_laws import Minimiser, Regime
@@ -30,13 +31,11 @@ def _warm() -> LevenbergMarquardt:
 class Restart:
     """How a family is solved anew.
 
-    segmentation: size of the segments, and about how many there are. residual_tolerance: ‖r‖ above which a member is
-    not solved.
+    segmentation: size of the segments, about how many there are, and ‖r‖ above which a member is not solved.
     """
 
     segmentation: Segmentation = field(default_factory=lambda: Segmentation(n_segments=4))
     optimizer: LevenbergMarquardt = field(default_factory=_warm)
-    residual_tolerance: float = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,7 +75,7 @@ class Family:
         alone = replace(made, known_knots=made.known_knots[member], known_times=made.known_times[member])
         return Curve(alone, self.xi[member])
 
-    @property
+    @cached_property
     def unknowns(self) -> Unknowns:
         return self.collocation.unpack(self.xi)
 
@@ -89,7 +88,7 @@ class Family:
     def n_arcs(self) -> int:
         return len(self.arc_knots) - 1
 
-    @property
+    @cached_property
     def arc_times(self) -> Tensor:
         """Scaled times (B, A + 1) at which arcs begin and end, on the clock of all."""
         return self.unknowns.times[:, self.arc_knots]
@@ -158,9 +157,7 @@ class Family:
         xi = collocation.pack(replace(guess, multipliers=whole.unknowns.multipliers))
         result = how.optimizer.run(collocation, xi)
         found = Family(collocation, result.xi)
-        stuck = torch.tensor([s in (Status.NON_FINITE, Status.DAMPING) for s in result.member_status])
-        small = (result.norm < how.residual_tolerance) | (result.norm < 1e-8) & stuck.to(result.norm.device)
-        return found, small & (found.disagreement() < 1e-6)
+        return found, (result.norm < how.segmentation.residual_tolerance) & (found.disagreement() < 1e-6)
 
     def _ahead(self, states: Tensor, start: Tensor, passed: int, segmentation: Segmentation) -> Collocation:
         """The arcs that lie ahead, cut into segments in the same way for all members."""
