@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import csv
 import json
 import math
@@ -9,8 +10,11 @@ import re
 import statistics
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
+
+import torch
 
 from ponn_torch.reporting.report import environment
 
@@ -110,6 +114,22 @@ def run_study(folder: Path, parts: Mapping[str, Callable[[], Report]], *, check_
         if not check_only:
             write(folder, name, report)
     return 0 if check(folder, list(parts), measured) else 1
+
+
+def run_seeded(
+    folder: Path, parts: Mapping[str, Callable[[range], Report]], description: str | None, seeds: int
+) -> int:
+    """A study's command line: which parts, how many seeds, whether results are written; the exit code."""
+    parser = argparse.ArgumentParser(description=description)
+    parser.add_argument("--parts", nargs="+", choices=parts, default=list(parts), help="default: all of them")
+    parser.add_argument("--seeds", type=int, default=seeds, help=f"seeds 0 … SEEDS − 1 (default {seeds})")
+    parser.add_argument("--check-only", action="store_true", help="do not write results")
+    given = parser.parse_args()
+    if given.seeds < 1:
+        parser.error(f"--seeds {given.seeds}; allowed: at least 1")
+    torch.set_num_threads(1)
+    chosen = {name: partial(parts[name], range(given.seeds)) for name in given.parts}
+    return run_study(folder, chosen, check_only=given.check_only)
 
 
 # -- checks --------------------------------------------------------------------------------------------------

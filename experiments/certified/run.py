@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import math
 import sys
 from collections.abc import Callable, Sequence
@@ -11,10 +10,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import torch
-
 from experiments.solves import fuel_by_mass, row
-from experiments.tables import Report, markdown, run_study, share, spread, worst
+from experiments.tables import Report, markdown, run_seeded, share, spread, worst
 from ponn_torch.optimal_control.problem import OptimalControlProblem
 from ponn_torch.problems.earth_mars import earth_mars
 from ponn_torch.problems.energy_transfer import energy_transfer_limited
@@ -145,14 +142,7 @@ def solve(name: str, seeds: Sequence[int]) -> Report:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--parts", nargs="+", choices=KNOWN, default=list(KNOWN))
-    parser.add_argument("--seeds", type=int, default=20, help="seeds 0 … SEEDS − 1 (default 20)")
-    parser.add_argument("--check-only", action="store_true", help="do not write results")
-    arguments = parser.parse_args()
-    torch.set_num_threads(1)
-    parts = {name: partial(solve, name, range(arguments.seeds)) for name in arguments.parts}
-    return run_study(FOLDER, parts, check_only=arguments.check_only)
+    return run_seeded(FOLDER, {name: partial(solve, name) for name in KNOWN}, __doc__, seeds=20)
 
 
 if __name__ == "__main__":

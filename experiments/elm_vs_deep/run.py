@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-import argparse
 import sys
-from functools import partial
 from pathlib import Path
 
-import torch
-
 from experiments.elm_vs_deep import arcs, landing, layers, transfer
-from experiments.tables import run_study
+from experiments.tables import run_seeded
 
 FOLDER = Path(__file__).parent
 PARTS = {
@@ -23,16 +19,7 @@ PARTS = {
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--parts", nargs="+", choices=PARTS, default=list(PARTS), help="default: all of them")
-    parser.add_argument("--seeds", type=int, default=5, help="seeds 0 … SEEDS − 1 (default 5)")
-    parser.add_argument("--check-only", action="store_true", help="do not write results")
-    arguments = parser.parse_args()
-    if arguments.seeds < 1:
-        parser.error(f"--seeds {arguments.seeds}; allowed: at least 1")
-    torch.set_num_threads(1)
-    parts = {name: partial(PARTS[name], range(arguments.seeds)) for name in arguments.parts}
-    return run_study(FOLDER, parts, check_only=arguments.check_only)
+    return run_seeded(FOLDER, PARTS, __doc__, seeds=5)
 
 
 if __name__ == "__main__":

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, Protocol, TypeVar
+from typing import Any, Protocol, TypeVar, cast
 
 import torch
 from torch import Tensor
@@ -287,3 +287,26 @@ def common(members: tuple[Status, ...]) -> Status:
 def restored(cls: type[Any], arrays: Arrays, like: Tensor) -> Any:
     """A state whose fields are all in the arrays."""
     return unpack(cls, arrays, like.device)
+
+
+class Driven:
+    """What makes a method an optimiser."""
+
+    def check(self, xi: Tensor) -> None:
+        """Raise ValueError for a ξ that the method cannot take."""
+
+    def run(
+        self,
+        residual: Residual,
+        xi: Tensor,
+        on_iteration: Callback | None = None,
+        checkpoint: Checkpoint | None = None,
+    ) -> OptimizeResult:
+        """Minimise ½‖r(ξ)‖² from ξ (..., N); one vector (N,) for gradient methods.
+
+        Raises:
+            NonFiniteResidual: r is not finite at the start, in no member of the batch; alone, a member has failed.
+            ValueError: a ξ that the method cannot take.
+        """
+        self.check(xi)
+        return drive(cast(Method[Any], self), residual, xi, on_iteration, checkpoint)

@@ -9,16 +9,20 @@ from dataclasses import dataclass, field, replace
 import torch
 from torch import Tensor
 
-from ponn_torch.optim.base import Callback, OptimizeResult, Residual, Stopping
-from ponn_torch.optim.checkpoint import Arrays, Checkpoint
-from ponn_torch.optim.driver import Counted, Move, drive, restored
+from ponn_torch.optim.base import Stopping
+from ponn_torch.optim.checkpoint import Arrays
+from ponn_torch.optim.driver import Counted, Driven, Move, restored
 from ponn_torch.optim.weighted import BALANCES
 
 
-def single(xi: Tensor) -> None:
-    """Raise ValueError where ξ is not one vector: gradient methods solve one problem at a time."""
-    if xi.dim() != 1:
-        raise ValueError(f"xi has shape {tuple(xi.shape)}; gradient methods solve one problem, shape (N,), at a time")
+class GradientMethod(Driven):
+    """Gradient methods solve one problem at a time."""
+
+    def check(self, xi: Tensor) -> None:
+        if xi.dim() != 1:
+            raise ValueError(
+                f"xi has shape {tuple(xi.shape)}; gradient methods solve one problem, shape (N,), at a time"
+            )
 
 
 # -- schedules: factor of the learning rate at a share of all iterations, ``last`` at its end -------------------------
@@ -62,7 +66,7 @@ class AdamState:
 
 
 @dataclass(frozen=True)
-class Adam:
+class Adam(GradientMethod):
     """Adam (Kingma & Ba 2015) with a schedule over the iteration limit.
 
     A step that is not finite is taken back: the moments start anew and the learning rate is halved for good.
@@ -96,21 +100,6 @@ class Adam:
         for name in ("memory", "square_memory"):
             if not 0 <= getattr(self, name) < 1:
                 raise ValueError(f"{name} = {getattr(self, name)}; allowed: from 0 to below 1")
-
-    def run(
-        self,
-        residual: Residual,
-        xi: Tensor,
-        on_iteration: Callback | None = None,
-        checkpoint: Checkpoint | None = None,
-    ) -> OptimizeResult:
-        """Minimise ½‖r(ξ)‖² from ξ (N,).
-
-        Raises:
-            NonFiniteResidual: r is not finite at the start. ValueError: a batch of problems.
-        """
-        single(xi)
-        return drive(self, residual, xi, on_iteration, checkpoint)
 
     def begin(self, residual: Counted, xi: Tensor) -> AdamState:
         r, gradient = residual.gradient(xi)

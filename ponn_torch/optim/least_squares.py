@@ -27,7 +27,7 @@ from ponn_torch.optim.base import (
     record,
 )
 from ponn_torch.optim.checkpoint import Arrays, Checkpoint
-from ponn_torch.optim.driver import Counted, Move, drive, restored
+from ponn_torch.optim.driver import Counted, Driven, Move, restored
 
 
 def _check_solver(linear_solver: str) -> None:
@@ -75,7 +75,7 @@ class DampedState:
 
 
 @dataclass(frozen=True)
-class LevenbergMarquardt:
+class LevenbergMarquardt(Driven):
     """Damped Gauss–Newton: ``scaling`` chooses D, Nielsen's rule moves μ, a step is taken only if ‖r‖ falls.
 
     Attributes:
@@ -103,20 +103,6 @@ class LevenbergMarquardt:
             raise ValueError(f"update = {self.update!r}; allowed: 'nielsen' or a factor above 1")
         if not self.damping >= 0:
             raise ValueError(f"damping = {self.damping}; allowed: a number ≥ 0")
-
-    def run(
-        self,
-        residual: Residual,
-        xi: Tensor,
-        on_iteration: Callback | None = None,
-        checkpoint: Checkpoint | None = None,
-    ) -> OptimizeResult:
-        """Minimise ½‖r(ξ)‖² from ξ (..., N).
-
-        Raises:
-            NonFiniteResidual: r is not finite at the start, in no member of the batch; alone, a member has failed.
-        """
-        return drive(self, residual, xi, on_iteration, checkpoint)
 
     def begin(self, residual: Counted, xi: Tensor) -> DampedState:
         r, jacobian = residual.linearise(xi)

@@ -13,10 +13,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ponn_torch.optim.base import Callback, OptimizeResult, Residual, Status, Stopping
-from ponn_torch.optim.checkpoint import Arrays, Checkpoint
-from ponn_torch.optim.driver import Counted, Move, drive, restored
-from ponn_torch.optim.gradient import single
+from ponn_torch.optim.base import Status, Stopping
+from ponn_torch.optim.checkpoint import Arrays
+from ponn_torch.optim.driver import Counted, Move, restored
+from ponn_torch.optim.gradient import GradientMethod
 from ponn_torch.optim.line_search import Trial, strong_wolfe
 
 
@@ -80,7 +80,7 @@ class LBFGSState:
 
 
 @dataclass(frozen=True)
-class LBFGS:
+class LBFGS(GradientMethod):
     """Limited-memory BFGS (Nocedal 1980): the last ``memory`` steps and changes of the gradient are its Hessian."""
 
     stopping: Stopping = field(default_factory=_quasi_newton_stopping)
@@ -89,21 +89,6 @@ class LBFGS:
     def __post_init__(self) -> None:
         if self.memory < 1:
             raise ValueError(f"memory = {self.memory}; allowed: at least 1")
-
-    def run(
-        self,
-        residual: Residual,
-        xi: Tensor,
-        on_iteration: Callback | None = None,
-        checkpoint: Checkpoint | None = None,
-    ) -> OptimizeResult:
-        """Minimise ½‖r(ξ)‖² from ξ (N,).
-
-        Raises:
-            NonFiniteResidual: r is not finite at the start. ValueError: a batch of problems.
-        """
-        single(xi)
-        return drive(self, residual, xi, on_iteration, checkpoint)
 
     def begin(self, residual: Counted, xi: Tensor) -> LBFGSState:
         r, gradient = residual.gradient(xi)
@@ -157,7 +142,7 @@ class BroydenState:
 
 
 @dataclass(frozen=True)
-class SSBroyden:
+class SSBroyden(GradientMethod):
     """Self-scaled Broyden: the inverse Hessian is scaled and its update chosen anew in every iteration.
 
     Urbán, Stefanou & Pons, J. Comput. Phys. 523 (2025) 113656, eq. 13–23. The inverse Hessian is a dense matrix, which
@@ -167,25 +152,14 @@ class SSBroyden:
     stopping: Stopping = field(default_factory=_quasi_newton_stopping)
     max_unknowns: int = 4000
 
-    def run(
-        self,
-        residual: Residual,
-        xi: Tensor,
-        on_iteration: Callback | None = None,
-        checkpoint: Checkpoint | None = None,
-    ) -> OptimizeResult:
-        """Minimise ½‖r(ξ)‖² from ξ (N,).
-
-        Raises:
-            NonFiniteResidual: r is not finite at the start. ValueError: a batch of problems, or too many unknowns.
-        """
-        single(xi)
+    def check(self, xi: Tensor) -> None:
+        """ValueError for a batch of problems, or too many unknowns."""
+        super().check(xi)
         if len(xi) > self.max_unknowns:
             raise ValueError(
                 f"max_unknowns = {self.max_unknowns}, and there are {len(xi)}; allowed: fewer unknowns, a larger "
                 "limit (the inverse Hessian is dense), or L-BFGS"
             )
-        return drive(self, residual, xi, on_iteration, checkpoint)
 
     def begin(self, residual: Counted, xi: Tensor) -> BroydenState:
         r, gradient = residual.gradient(xi)
