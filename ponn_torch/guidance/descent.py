@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from ponn_torch.guidance.replanning import Fleet
+from ponn_torch.numerics.runge_kutta import runge_kutta
 from ponn_torch.optim.base import Stopwatch
 from ponn_torch.optimal_control.problem import Named, OptimalControlProblem
 from ponn_torch.solving.family import Restart
@@ -154,12 +155,7 @@ class _Plant:
 
     def fly(self, x: Tensor, thrust: Tensor, h: Tensor, factor: Tensor) -> Tensor:
         """One Runge–Kutta step h (B, 1) under thrust (B, 3, 3) at its beginning, middle and end."""
-        first, middle, last = (factor * thrust[:, i] for i in range(3))
-        k1 = self._rates(x, first)
-        k2 = self._rates(x + h / 2 * k1, middle)
-        k3 = self._rates(x + h / 2 * k2, middle)
-        k4 = self._rates(x + h * k3, last)
-        return x + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
+        return runge_kutta(lambda share, x: self._rates(x, factor * thrust[:, int(2 * share)]), x, h)
 
 
 def land(

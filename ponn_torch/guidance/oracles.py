@@ -19,6 +19,7 @@ from torch.func import vjp
 from ponn_torch.guidance.expansion import derivatives, expand
 from ponn_torch.guidance.producers import Plan
 from ponn_torch.guidance.tracking import TrackingProblem
+from ponn_torch.numerics.runge_kutta import runge_kutta
 
 System = Callable[[Tensor], tuple[Tensor, Tensor]]  # t () -> M (..., 2n, 2n), c (..., 2n)
 
@@ -69,11 +70,7 @@ def riccati_sweep(
         h = (start - end) / n_substeps
         for i in range(n_substeps):
             t = end + i * h
-            k1 = rate(t, relation)
-            k2 = rate(t + h / 2, relation + h / 2 * k1)
-            k3 = rate(t + h / 2, relation + h / 2 * k2)
-            k4 = rate(t + h, relation + h * k3)
-            relation = relation + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
+            relation = runge_kutta(lambda share, x, t=t, h=h: rate(t + share * h, x), relation, h)  # type: ignore[misc]
     return relation[..., :n], relation[..., n]
 
 

@@ -16,6 +16,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ponn_torch.numerics.runge_kutta import runge_kutta
 from ponn_torch.optimal_control.problem import DisplayUnit
 
 Dynamics = Callable[[Tensor, Tensor, Tensor], Tensor]
@@ -70,14 +71,9 @@ class Plant:
 
     def fly(self, t: float, x: Tensor, u: Tensor, duration: float, n_substeps: int) -> Tensor:
         """x (..., n) after a time with the control held, by classical Runge–Kutta."""
-        h, f = duration / n_substeps, self.dynamics
+        h = duration / n_substeps
         for i in range(n_substeps):
-            now, middle, after = (x.new_tensor(t + (i + part) * h) for part in (0.0, 0.5, 1.0))
-            k1 = f(now, x, u)
-            k2 = f(middle, x + h / 2 * k1, u)
-            k3 = f(middle, x + h / 2 * k2, u)
-            k4 = f(after, x + h * k3, u)
-            x = x + h / 6 * (k1 + 2 * (k2 + k3) + k4)
+            x = runge_kutta(lambda share, x, i=i: self.dynamics(x.new_tensor(t + (i + share) * h), x, u), x, h)  # type: ignore[misc]
         return x
 
 
