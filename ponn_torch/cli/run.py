@@ -119,7 +119,7 @@ class SolveJob:
     ) -> None:
         self._config, self._folder, self._plan = config, folder, plan
         self._overrides, self._choices = overrides, choices
-        self._keeper, self._resume = _Keeper(), resume
+        self._keeper, self._resume, self._cut = _Keeper(), resume, False
         # before the folder is cleared
         self._replay = recorded(folder / RECORDS) if resume else {}
 
@@ -155,7 +155,8 @@ class SolveJob:
         if result.interrupted:
             code = INTERRUPTED
         message = result.message
-        if code == NOT_CERTIFIED and plan.explain:
+        self._cut = result.interrupted or result.spent
+        if code == NOT_CERTIFIED and plan.explain and not self._cut:
             print("not certified; looking for a reason …", flush=True)
             message = "; ".join([message, *explanation(plan.problem, plan.solver, plan.seed, result.solution)])
         return Outcome(code, message)
@@ -180,7 +181,7 @@ class SolveJob:
     def keep(self, outcome: Outcome) -> None:
         """Save the best solution and write the report; the figures last, for they are most likely to fail."""
         plan, best = self._plan, self._keeper.best
-        if outcome.exit_code in (DONE, NOT_CERTIFIED) and not any(stage.status.cut for stage in self._keeper.stages):
+        if outcome.exit_code in (DONE, NOT_CERTIFIED) and not self._cut:
             shutil.rmtree(self._folder / CHECKPOINTS, ignore_errors=True)  # nothing is left to go on with
         if best is not None:
             best.save(self._folder / SOLUTION)

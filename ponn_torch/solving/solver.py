@@ -63,6 +63,7 @@ class SolveResult:
     message: str
     cpu_seconds: float
     interrupted: bool = False
+    spent: bool = False
 
     @property
     def certified(self) -> bool:
@@ -237,7 +238,8 @@ class _Run:
                     break
         except (_Interrupted, KeyboardInterrupt):
             interrupted, message = True, "interrupted; the best stage so far is kept"
-        if self.clock.spent and not (best and best[1].certified) and Status.BUDGET.value not in message:
+        spent = self.clock.spent and n_certified < self.solver.n_certified
+        if spent and not (best and best[1].certified) and Status.BUDGET.value not in message:
             message = f"{Status.BUDGET.value}: {message}"
         solution = best[0] if best else self._last_stage()
         if solution is not None:
@@ -247,7 +249,8 @@ class _Run:
         else:
             self.observer.failed(message)
         certificate = best[1] if best else None
-        return SolveResult(solution, certificate, self.stages, self.start + 1, message, self.clock.seconds, interrupted)
+        seconds = self.clock.seconds
+        return SolveResult(solution, certificate, self.stages, self.start + 1, message, seconds, interrupted, spent)
 
     def _one_start(self) -> tuple[Solution | None, str]:
         """Everything between a first guess and a trajectory to be judged; None and why where that fails."""
