@@ -18,6 +18,8 @@ from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 from ponn_torch.ansatz.basis import FreeFunction
 from ponn_torch.optim.base import Optimizer
 from ponn_torch.optim.chain import Chain
+from ponn_torch.optim.weighted import WeightedEquations, check_equations
+from ponn_torch.optimal_control.collocation import equation_names
 from ponn_torch.optimal_control.pontryagin import pontryagin
 from ponn_torch.optimal_control.problem import OptimalControlProblem, nearest
 from ponn_torch.optimal_control.references import load_problem
@@ -182,6 +184,11 @@ def _solver(node: dict[str, Any], top: Mapping[str, Any]) -> Solver:
     reject_unknown(nodes, ["kind", "n_nodes"], "nodes")
     for key in ("form", "optimizer", "continuation", "guess"):
         fields[key] = value_of(_section(node, key), hints[key], key)
+    weights = _section(node, "weights")
+    if weights:
+        arguments = {"optimizer": fields["optimizer"], "weights": weights.pop("equations", {})}
+        reject_unknown(weights, ["equations"], "weights")
+        fields["optimizer"] = call(WeightedEquations, arguments, "weights")
     finish = _section(node, "finish")
     if finish:
         parts = [fields["optimizer"], value_of(finish, Optimizer, "finish")]
@@ -216,7 +223,10 @@ def _rehearse(plan: Plan) -> None:
     except ValueError as error:
         raise ConfigError(located(error, "", ["mass_variable"], label="problem")) from error
     try:
-        _ = solver.discretisation(bvp).expressions
+        disc = solver.discretisation(bvp)
+        _ = disc.expressions
+        data = ["data"] if solver.data is not None else []
+        check_equations((plan.settings.get("weights") or {}).get("equations", {}), [*equation_names(disc), *data])
         solver.guess.curve(bvp, 1000 * plan.seed)
         if solver.data is not None:
             solver.data.of(plan.problem)

@@ -10,6 +10,8 @@ import time
 from pathlib import Path
 
 import pytest
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+from tensorboard.plugins.hparams import plugin_data_pb2
 
 from ponn_torch.cli import main
 from ponn_torch.cli.overrides import read
@@ -84,6 +86,8 @@ def events_in(folder: Path) -> list[str]:
         ("budget.seconds=3", ["budget.seconds", "cpu_seconds"]),
         ("finish=output_layr", ["finish = 'output_layr'", "'output_layer'"]),
         ("optimizer=adam_lbgs", ["optimizer = 'adam_lbgs'", "'adam_lbfgs'"]),
+        ("weights.equations.r=3", ["weights.r: no such equation", "v_1", "lambda_m"]),
+        ("weights.equations.v_1=0", ["weights.v_1 = 0", "a positive number"]),
         ("device=gpu", ["device = 'gpu'", "cpu"]),
         ("problem.final_time_days=long", ["problem.final_time_days = 'long'", "a number"]),
         ("problem.final_time_days=-3", ["problem.final_time_days = -3", "positive"]),
@@ -254,6 +258,25 @@ def test_a_resumed_run_ends_as_the_uninterrupted_one(
     assert 0 < len(short) < len(iterations_in(whole))
     found, expected = (Solution.load(folder / "solution").curve.xi.tolist() for folder in (cut, whole))
     assert found == expected  # bit for bit
+
+
+def test_a_resumed_run_tells_tensorboard_what_was_chosen(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("ponn_torch.optim.base.time.process_time", map(float, itertools.count()).__next__)
+    sizes = ["ansatz=legendre", "ansatz.size=12", "nodes.n_nodes=20", "optimizer=lbfgs", "start_limit=100"]
+    tiny = ["optimizer.stopping.max_iterations=9", "continuation=single", "refinement=none", "record.tensorboard=true"]
+    main([*LANDING, *sizes, *tiny, "budget.cpu_seconds=8", f"hydra.run.dir='{tmp_path}'"])
+    before = hyperparameters_in(tmp_path)
+    assert {"ansatz": "legendre", "optimizer": "lbfgs", "continuation": "single"}.items() <= before.items()
+    assert main([f"resume={tmp_path}", "budget.cpu_seconds=.inf"]) == 0
+    assert hyperparameters_in(tmp_path) == before | {"budget.cpu_seconds": ".inf"}
+
+
+def hyperparameters_in(folder: Path) -> dict[str, object]:
+    accumulator = EventAccumulator(str(folder))
+    accumulator.Reload()
+    started = accumulator.PluginTagToContent("hparams")["_hparams_/session_start_info"]
+    values = plugin_data_pb2.HParamsPluginData.FromString(started).session_start_info.hparams
+    return {name: value.string_value or value.number_value for name, value in values.items()}
 
 
 def iterations_in(folder: Path) -> list[dict[str, object]]:

@@ -18,6 +18,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 SWITCHES = ("--multirun", "-m", "--resolve", "--info", "--hydra-help", "--shell-completion")
 WITH_VALUE = ("--cfg", "-c", "--package", "-p", "--info", "-i", "--config-dir", "-cd")
+OPEN = ("problem.arguments.", "weights.equations.")  # settings whose names the problem gives
 VALUES = ("job", "hydra", "all", "config", "defaults", "defaults-tree", "plugins", "searchpath")
 
 
@@ -159,9 +160,9 @@ def _split(arguments: Sequence[str]) -> tuple[list[str], list[str]]:
 
 
 def _own_problem(text: str) -> list[str]:
-    """``problem=file.py:function`` as overrides of the config ``problem=custom``; anything else as it is."""
+    """``problem=file.py:function`` as overrides of ``problem=custom``, open settings as additions; else as it is."""
     key, separator, value = text.partition("=")
-    if key.startswith("problem.arguments."):
+    if key.startswith(OPEN):
         return [f"++{text}"]
     reference = value.strip("'\"")
     if key != "problem" or not separator or ":" not in reference:

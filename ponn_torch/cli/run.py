@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 
 from ponn_torch.build import Plan, build, resolved
 from ponn_torch.cli.explain import explanation
@@ -27,6 +27,8 @@ from ponn_torch.solving.certificate import Certificate
 from ponn_torch.solving.journal import Journal
 from ponn_torch.solving.observer import StageResult
 from ponn_torch.solving.solution import Solution
+
+CHOICES = "choices.yaml"
 
 
 class _Keeper(Recorder):
@@ -69,8 +71,19 @@ def run(
 
 def resume(config: DictConfig, folder: Path, overrides: Sequence[str]) -> Outcome:
     """Go on with the run in a folder from its checkpoints; it ends as the uninterrupted run would have."""
-    job = SolveJob(config, folder, overrides, None, {}, resume=True)
+    job = SolveJob(config, folder, overrides, None, _choices_before(folder), resume=True)
     return run_job(job, folder, overrides, resume=True)
+
+
+def _keep_choices(folder: Path, choices: Mapping[str, Any]) -> None:
+    """Leave the names of the groups' configs with the checkpoints, for a run that goes on with its config alone."""
+    (folder / CHECKPOINTS).mkdir(exist_ok=True)
+    OmegaConf.save(OmegaConf.create(dict(choices)), folder / CHECKPOINTS / CHOICES)
+
+
+def _choices_before(folder: Path) -> dict[str, Any]:
+    path = folder / CHECKPOINTS / CHOICES
+    return {str(group): name for group, name in OmegaConf.load(path).items()} if path.is_file() else {}
 
 
 def _told_apart(plan: Plan, overrides: Sequence[str], choices: Mapping[str, Any]) -> dict[str, Any]:
@@ -146,6 +159,7 @@ class SolveJob:
             replay=self._replay,
             extra=(self._keeper,),
         )
+        _keep_choices(self._folder, self._choices)
         journal = Journal(self._folder / CHECKPOINTS, resume=self._resume)
         with recorder:
             result = plan.solver.solve(plan.problem, plan.seed, recorder, journal)

@@ -1,4 +1,4 @@
-"""Weights of equations in the loss ½‖W r‖²: fixed ones around any residual, adaptive ones for gradient methods.
+"""Weights of equations in the loss ½‖W r‖²: fixed ones for any optimiser, adaptive ones for gradient methods.
 
 Least squares by Levenberg–Marquardt need none: a residual that vanishes does so whatever its weights. A gradient method
 goes where the largest equation pulls, and profits from equations that pull alike.
@@ -6,16 +6,19 @@ goes where the largest equation pulls, and profits from equations that pull alik
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import cast
 
 import torch
 from torch import Tensor
 
 from ponn_torch.numerics.linalg import Jacobian
-from ponn_torch.optim.base import Residual
+from ponn_torch.optim.base import Callback, Optimizer, OptimizeResult, Residual
+from ponn_torch.optim.checkpoint import Checkpoint
 from ponn_torch.optim.driver import Counted
+from ponn_torch.optim.restricted import Layered
 
 LARGEST = 1e3  # of an adaptive weight, and its inverse the smallest
 
@@ -27,6 +30,20 @@ def rows_of(blocks: Callable[[Tensor], Mapping[str, Tensor]], r: Tensor) -> dict
         norms = blocks(ones)
     slopes = {name: torch.autograd.grad(norm, ones, retain_graph=True)[0] for name, norm in norms.items()}
     return {name: slope != 0 for name, slope in slopes.items()}
+
+
+def _check_positive(weights: Mapping[str, float]) -> None:
+    for name, weight in weights.items():
+        if not 0 < weight < float("inf"):
+            raise ValueError(f"weights.{name} = {weight}; allowed: a positive number")
+
+
+def check_equations(weights: Mapping[str, float], equations: Iterable[str]) -> None:
+    """ValueError for a weight of no equation."""
+    names = list(equations)
+    for name in weights:
+        if name not in names:
+            raise ValueError(f"weights.{name}: no such equation; allowed: {', '.join(names)}")
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,13 +58,16 @@ class Weighted:
     weights: Mapping[str, float]
 
     def __post_init__(self) -> None:
-        for name, weight in self.weights.items():
-            if not 0 < weight < float("inf"):
-                raise ValueError(f"weights.{name} = {weight}; allowed: a positive number")
+        _check_positive(self.weights)
 
     @property
     def n_unknowns(self) -> int:
         return self.inner.n_unknowns
+
+    @property
+    def linear_unknowns(self) -> Tensor:
+        """Those of a residual that knows its output layer."""
+        return cast(Layered, self.inner).linear_unknowns
 
     @cached_property
     def _rows(self) -> dict[int, Tensor]:
@@ -59,9 +79,7 @@ class Weighted:
         if size not in self._rows:
             flat = r.detach().reshape(-1, size)[0]
             rows = rows_of(self.inner.blocks, flat)
-            unknown = [name for name in self.weights if name not in rows]
-            if unknown:
-                raise ValueError(f"weights.{unknown[0]}: no such equation; allowed: {', '.join(rows)}")
+            check_equations(self.weights, rows)
             factors = torch.ones_like(flat)
             for name, weight in self.weights.items():
                 factors = torch.where(rows[name], weight, factors)
@@ -79,6 +97,32 @@ class Weighted:
 
     def blocks(self, residual: Tensor) -> Mapping[str, Tensor]:
         return self.inner.blocks(residual)
+
+
+@dataclass(frozen=True)
+class WeightedEquations:
+    """Run an optimiser on W r; its records and rules are those of W r, the norm of the result is that of r.
+
+    Raises:
+        ValueError: a weight that is not positive, or (in ``run``) of no equation.
+    """
+
+    optimizer: Optimizer
+    weights: Mapping[str, float]
+
+    def __post_init__(self) -> None:
+        _check_positive(self.weights)
+
+    def run(
+        self,
+        residual: Residual,
+        xi: Tensor,
+        on_iteration: Callback | None = None,
+        checkpoint: Checkpoint | None = None,
+    ) -> OptimizeResult:
+        """Minimise ½‖W r(ξ)‖² from ξ."""
+        result = self.optimizer.run(Weighted(residual, self.weights), xi, on_iteration, checkpoint)
+        return replace(result, norm=residual.residual(result.xi).norm(dim=-1))
 
 
 # -- adaptive weights (R,) of the equations at a point ---------------------------------------------------------------

@@ -388,3 +388,9 @@ def component_names(bvp: BoundaryValueProblem) -> list[str]:
     """Names of the columns of w: states, then costates with the prefix lambda_."""
     states = bvp.problem.component_names
     return [*states, *(f"lambda_{name}" for name in states)]
+
+
+def equation_names(disc: Discretisation) -> list[str]:
+    """Names of the equations of a single domain, as its ``blocks`` have them."""
+    names, columns = component_names(disc.bvp), torch.cat([group.columns[:, -1] for group in disc.groups])
+    return [*(names[column] for column in columns.tolist()), *(["terminal"] if disc.bvp.n_terminal_rows else [])]

@@ -1,17 +1,21 @@
 """Weights of equations: rows found, Jacobians scaled, balances that make equations pull alike, also when resumed."""
 
+import math
+
 import pytest
 import torch
 from helpers import bvp_of, collocation, random, relative
 from test_checkpoint import interrupt_at
 from test_least_squares import Pointwise, landing, start_of
 
+from ponn_torch.ansatz.networks import MLP
 from ponn_torch.optim.base import Stopping
+from ponn_torch.optim.chain import OutputLayer
 from ponn_torch.optim.checkpoint import CheckpointFile
 from ponn_torch.optim.driver import Counted
 from ponn_torch.optim.gradient import Adam
 from ponn_torch.optim.least_squares import LevenbergMarquardt
-from ponn_torch.optim.weighted import BALANCES, Weighted, gradient_norm, ntk_trace, rows_of
+from ponn_torch.optim.weighted import BALANCES, Weighted, WeightedEquations, gradient_norm, ntk_trace, rows_of
 
 
 def test_rows_of_equations_part_the_residual():
@@ -46,6 +50,28 @@ def test_weights_do_not_move_a_solution_and_move_a_compromise():
     residual, start = start_of("rosenbrock")
     found = LevenbergMarquardt(Stopping(tolerance=1e-12)).run(Weighted(residual, {"first": 7.0}), start)
     torch.testing.assert_close(found.xi, torch.ones(2, dtype=torch.float64), rtol=1e-9, atol=0)
+
+
+def test_an_optimiser_on_weighted_equations_is_judged_by_the_plain_ones():
+    line = Pointwise(lambda x: torch.stack([x[0] - 1.0, x[0] - 2.0, x[1]]), 2)
+    start = torch.zeros(2, dtype=torch.float64)
+    seen = []
+    made = WeightedEquations(LevenbergMarquardt(), {"first": 3.0})
+    found = made.run(line, start, lambda entry, xi, r: seen.append(entry["norm"]))
+    assert torch.equal(found.xi, LevenbergMarquardt().run(Weighted(line, {"first": 3.0}), start).xi)
+    assert float(found.norm) == float(line.residual(found.xi).norm())
+    assert seen[-1] == pytest.approx(math.sqrt(9 * 0.1**2 + 0.9**2), rel=1e-6)  # at 1.1
+
+
+def test_output_layers_of_weighted_equations():
+    made = collocation(bvp_of("minimum_time"), basis=lambda n: MLP((n, n)), smoothing=1.0)
+    xi = random(made.n_unknowns, seed=1)
+    layer = OutputLayer(LevenbergMarquardt(Stopping(max_iterations=3)))
+    found = WeightedEquations(layer, {"v": 3.0}).run(made, xi)
+    hidden = torch.ones(made.n_unknowns, dtype=torch.bool)
+    hidden[made.linear_unknowns] = False
+    assert torch.equal(found.xi[hidden], xi[hidden])
+    assert float(found.norm) < float(made.residual(xi).norm())
 
 
 def test_balances_make_equations_alike():
