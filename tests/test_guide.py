@@ -11,28 +11,47 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from test_configs import CONFIGS, calls
 
 from ponn_torch.cli import guide
-from ponn_torch.cli.flight import FlightPlan, build, run
+from ponn_torch.cli.flight import KINDS, build, run
+from ponn_torch.cli.landing import Descent
+from ponn_torch.cli.mission import Mission
 from ponn_torch.cli.overrides import RHC, groups, read
+from ponn_torch.cli.tracking import Tracking
 from ponn_torch.guidance import closed_loop
-from ponn_torch.guidance.closed_loop import Loop
 from ponn_torch.guidance.storage import load_flight
 from ponn_torch.settings import ROOMS, target
 
 ROOT = CONFIGS / "rhc"
+CHOSEN_BY_OTHERS = {("flight", "landing"), ("replanning", "default"), ("flight", "tracking")}  # flown with a problem
 OPTIONS = sorted((path.parent.name, path.stem) for path in ROOT.glob("*/*.yaml") if path.parent.name != "hydra")
+LONG = {("problem", "powered_descent_three_arcs"), ("replanning", "undisturbed")}  # seconds, and one landing is enough
+FLOWN = [
+    pytest.param(*pair, marks=[pytest.mark.slow] if pair in LONG else [], id="-".join(pair))
+    for pair in OPTIONS
+    if pair not in CHOSEN_BY_OTHERS
+]
 
 
 def composed(*overrides: str) -> DictConfig:
     with initialize_config_dir(str(ROOT), version_base="1.3"):
-        return compose("track", list(overrides))
+        return compose("fly", list(overrides))
 
 
-def built(*overrides: str) -> FlightPlan:
+def built(*overrides: str) -> Mission:
     return build(composed(*overrides))
+
+
+def chosen_by(group: str, option: str) -> list[str]:
+    """Overrides that choose a config; those of a landing's group need a landing."""
+    landing = group == "replanning" or (group, option) == ("flight", "landing")
+    return ["problem=powered_descent"] * landing + [f"{group}={option}"]
 
 
 def tiny(group: str, option: str) -> list[str]:
     """A flight of a few cycles."""
+    made = built(*chosen_by(group, option))
+    if isinstance(made, Descent):
+        few = ["replanning.cycle=5", "replanning.step=0.25", "problem.planned_share=1", "n_samples=1"]
+        return [*chosen_by(group, option), *few, "record=minimal"]
     chosen = ["problem=clohessy_wiltshire", "n_samples=2", "record=minimal"]
     chosen = [text for text in chosen if not text.startswith(f"{group}=")] + [f"{group}={option}"]
     if option == "rbf_swarm":
@@ -48,21 +67,23 @@ def tiny(group: str, option: str) -> list[str]:
 
 def test_the_glob_sees_every_group() -> None:
     assert {group for group, _ in OPTIONS} == {path.name for path in ROOT.iterdir() if path.is_dir()} - {"hydra"}
-    assert set(groups(RHC)) == {"problem", "method", "passes", "loop", "record", "hydra"}
+    assert set(groups(RHC)) == {group for group, _ in OPTIONS} | {"hydra"}
+    assert sorted(path.stem for path in (ROOT / "flight").glob("*.yaml")) == sorted(KINDS)
 
 
 @pytest.mark.parametrize(("group", "option"), OPTIONS)
 def test_config_builds_opens_with_what_it_is_and_holds_every_setting(group: str, option: str) -> None:
-    plan = built(f"{group}={option}")
-    text = (ROOT / group / f"{option}.yaml").read_text(encoding="utf-8").partition("\n")[0]
+    plan = built(*chosen_by(group, option)).common
+    lines = (ROOT / group / f"{option}.yaml").read_text(encoding="utf-8").splitlines()
+    text = next(line for line in lines if not line.startswith("# @package"))
     assert text.startswith("# ")
     assert len(text) < 120
-    for node in calls(plan.settings[group]):
+    for node in calls(plan.settings.get(group, {})):
         parameters = inspect.signature(target(node["_target_"], "_target_", ROOMS)).parameters
         assert set(parameters) - set(node) <= {"dtype", "device"}
 
 
-@pytest.mark.parametrize(("group", "option"), OPTIONS)
+@pytest.mark.parametrize(("group", "option"), FLOWN)
 def test_config_flies(group: str, option: str, tmp_path: Path) -> None:
     outcome = run(composed(*tiny(group, option)), tmp_path, tiny(group, option))
     assert outcome.exit_code in (0, 2), outcome.message
@@ -142,7 +163,7 @@ def test_an_error_inside_leaves_its_reason(tmp_path: Path, monkeypatch: pytest.M
 @pytest.mark.parametrize(
     ("argument", "told"),
     [
-        ("problem=quadroter", "problem = 'quadroter'; allowed: clohessy_wiltshire, quadrotor, shuttle (did you mean"),
+        ("problem=quadroter", "problem = 'quadroter'; allowed: clohessy_wiltshire, powered_descent, "),
         ("problem.horizn=3", "problem.horizn: no such setting; allowed: "),
         ("problem.horizon=5", "problem.horizon = 5 s; allowed: at least one cycle, 10"),
         ("problem.horizon=far", "problem.horizon = 'far'; allowed: a number"),
@@ -153,6 +174,12 @@ def test_an_error_inside_leaves_its_reason(tmp_path: Path, monkeypatch: pytest.M
         ("loop.noise=[1.0]", "loop.noise = [1.0]; allowed: one per state, r1"),
         ("loop.deadline=-1", "loop.deadline = -1.0; allowed: above 0 s"),
         ("n_vehicles=-1", "n_vehicles = -1; allowed: an integer from 0"),
+        ("kind=flying", "kind = 'flying'; allowed: tracking, landing"),
+        (
+            "replanning=default",
+            "replanning: no group of what is chosen here; allowed: record, problem, method, passes, loop",
+        ),
+        ("iteration_error=0", "iteration_error = 0.0; allowed: above 0"),
         ("problem=x.py:f", "problem = 'x.py:f'"),
     ],
 )
@@ -177,7 +204,8 @@ def test_help_and_sweeps(tmp_path: Path, capsys: pytest.CaptureFixture[str], mon
     for option in ("--help", "--config-groups", "--version"):
         assert guide([option]) == 0
     said = capsys.readouterr().out
-    assert "clohessy_wiltshire, quadrotor, shuttle" in said
+    assert "clohessy_wiltshire, powered_descent" in said
+    assert "replanning" in said
     assert "Rendezvous on a circular orbit" in said
     monkeypatch.chdir(tmp_path)
     arguments = ["-m", "method=chebyshev,igpm", "problem.final_time=30", "record=minimal", "hydra.sweep.dir=sweep"]
@@ -188,5 +216,5 @@ def test_help_and_sweeps(tmp_path: Path, capsys: pytest.CaptureFixture[str], mon
 
 def test_noise_is_given_in_the_units_that_figures_show() -> None:
     plan = built("loop.noise=[10,10,10,0.1,0.1,0.1]")
-    assert isinstance(plan.loop, Loop)
+    assert isinstance(plan, Tracking)
     assert plan.loop.noise[0] == pytest.approx(10 / 7.5e6)

@@ -37,7 +37,7 @@ class Application:
 
 
 PONN = Application("ponn", "solve", own_problem=True, resumable=True)
-RHC = Application("ponn-rhc", "track", "rhc")
+RHC = Application("ponn-rhc", "fly", "rhc")
 APPLICATIONS = {application.program: application for application in (PONN, RHC)}
 
 
@@ -70,11 +70,19 @@ def config_folder(application: Application = PONN) -> Path:
 
 
 def groups(application: Application = PONN) -> dict[str, list[str]]:
-    """Options per config group, in the order of the main config's defaults."""
+    """Options per config group, in the order of the main config's defaults; then those that its options bring."""
     folder = config_folder(application)
-    given = OmegaConf.load(folder / f"{application.config}.yaml")
-    named = [str(key) for entry in given.defaults if isinstance(entry, DictConfig) for key in entry]
+    named = _defaults(folder / f"{application.config}.yaml")
+    further = [key for name in named for path in sorted((folder / name).glob("*.yaml")) for key in _defaults(path)]
+    named += [key[1:] for key in dict.fromkeys(further) if key.startswith("/") and key[1:] not in named]
     return {name: sorted(path.stem for path in (folder / name).glob("*.yaml")) for name in named}
+
+
+def _defaults(path: Path) -> list[str]:
+    """Keys of a config's defaults list."""
+    given = OmegaConf.load(path)
+    entries = given.get("defaults", []) if isinstance(given, DictConfig) else []
+    return [str(key) for entry in entries if isinstance(entry, DictConfig) for key in entry]
 
 
 def nearest(name: str, allowed: Sequence[str]) -> str:
@@ -198,7 +206,15 @@ def _check(overrides: Sequence[str], application: Application) -> None:
                 raise InputError(f"{name} = {value!r}; " + hint.replace(" (did", f"{extra} (did", 1))
         if values:
             chosen.append(f"{name}={values[0]}")
-    base = _compose(chosen, application, with_hydra=True)
+    try:
+        base = _compose(chosen, application, with_hydra=True)
+    except HydraException as error:
+        absent = re.match(r"Could not override '(\w+)'", str(error))
+        if absent is None:
+            raise InputError(one_line(error)) from error
+        base = _compose([text for text in chosen if not text.startswith(f"{absent[1]}=")], application)
+        allowed = [name for name in options if name in base]
+        raise InputError(f"{absent[1]}: no group of what is chosen here; {nearest(absent[1], allowed)}") from error
     for override in parsed:
         name = override.key_or_group
         plugin = name.startswith(("hydra/", "hydra.launcher."))  # Hydra knows what is installed

@@ -38,7 +38,7 @@ Exit code: 0 certified (finished, where the refinement claims no certificate), 1
 """
 
 GUIDE = """\
-ponn-rhc: track a reference in closed loop, each control from the solution of a horizon's boundary value problem.
+ponn-rhc: fly a plant in closed loop, each control from an optimal control problem solved from where it is.
 
   ponn-rhc [GROUP=CONFIG ...] [KEY=VALUE ...] [-m]
 
@@ -47,6 +47,7 @@ Examples
   ponn-rhc problem=quadrotor passes=newton            a manoeuvre, Newton's method on every horizon
   ponn-rhc problem=shuttle n_vehicles=500             entry, and a Monte Carlo of 500 vehicles
   ponn-rhc problem=quadrotor method=rbf_swarm         Gaussians tuned by a particle swarm
+  ponn-rhc problem=powered_descent n_vehicles=200     fuel-optimal descents planned anew every second
   ponn-rhc problem.horizon=70 ending=shrink           other data
   ponn-rhc -m method=chebyshev,igpm,rbf               a sweep
 
@@ -67,7 +68,8 @@ USAGES = {PONN: SOLVE, RHC: GUIDE}
 
 def first_comment(path: Path) -> str:
     """The line that opens a config."""
-    line = path.read_text(encoding="utf-8").partition("\n")[0]
+    lines = path.read_text(encoding="utf-8").splitlines()
+    line = next((line for line in lines if not line.startswith("# @package")), "")
     return line.removeprefix("#").strip() if line.startswith("#") else ""
 
 

@@ -72,6 +72,16 @@ class Flight:
         return len(self.commands)
 
     @property
+    def alone(self) -> bool:
+        """Whether there is one vehicle."""
+        return self.states.dim() == 2
+
+    @property
+    def rows(self) -> Tensor:
+        """Time, state and control of one vehicle at every cycle, (C, 1 + n + m): columns as in ``displayed``."""
+        return torch.cat([self.times[:-1, None], self.states[:-1], self.controls], -1)
+
+    @property
     def n_late(self) -> int:
         return int(self.late.sum())
 

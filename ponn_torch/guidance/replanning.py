@@ -22,11 +22,6 @@ class Fleet:
     """B landers and the plan that each follows."""
 
     def __init__(self, planned: Solution, states: Tensor, restart: Restart | None = None) -> None:
-        if planned.problem.states != {"r": 3, "v": 3, "m": 1} or not planned.problem.free_final_time:
-            raise ValueError(
-                f"problem {planned.problem.name!r} has states {dict(planned.problem.states)}; allowed: r (3), v (3), "
-                "m (1) with a free final time"
-            )
         self.bvp, self.restart, count = planned.bvp, restart or Restart(), len(states)
         self.plans: list[tuple[Family, int]] = [(Family.of(planned.curve), 0)] * count  # a family, and who in it
         self.n_plans, self.n_kept, self.n_repaired = (torch.zeros(count, dtype=torch.long) for _ in range(3))
@@ -66,6 +61,11 @@ class Fleet:
                 else:
                     self._repair(i, found, row)
             self._note(who)
+
+    def return_to(self, plans: Sequence[tuple[Family, int]], members: list[int]) -> None:
+        """Follow earlier plans again."""
+        self.plans = list(plans)
+        self._note(members)
 
     def _repair(self, i: int, found: Family, row: int) -> None:
         """Let the split look for other arcs; its own clock starts at zero."""

@@ -6,6 +6,7 @@ import csv
 import importlib
 import json
 from collections.abc import Mapping
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -14,62 +15,66 @@ import torch
 
 from ponn_torch import __version__
 from ponn_torch.guidance.closed_loop import Flight
-from ponn_torch.guidance.tracking import Plant, TrackingProblem
+from ponn_torch.guidance.descent import Landing, PoweredDescent
+from ponn_torch.guidance.tracking import TrackingProblem
 
 DESCRIPTION, ARRAYS, TABLE = "flight.json", "flight.npz", "flight.csv"
 FORMAT = 1
 PLANTS = "ponn_torch.guidance.plants."
-_FIELDS = ("times", "states", "measured", "commands", "controls", "loss", "passes", "seconds", "late")
+Problem = TrackingProblem | PoweredDescent
+Flown = Flight | Landing
+KINDS: dict[type[Problem], type[Flown]] = {TrackingProblem: Flight, PoweredDescent: Landing}  # what flies what
 
 
-def make_problem(reference: str, arguments: Mapping[str, Any]) -> TrackingProblem:
+def make_problem(reference: str, arguments: Mapping[str, Any]) -> Problem:
     """Call "module:function" of the package's plants; a name elsewhere is refused, for a file may hold any."""
     module, _, name = reference.partition(":")
     if not module.startswith(PLANTS):
         raise ValueError(f"problem = {reference!r}; allowed: functions of {PLANTS.rstrip('.')}")
-    problem = getattr(importlib.import_module(module), name)(**arguments)
-    if not isinstance(problem, TrackingProblem):
-        raise ValueError(f"problem = {reference!r} makes a {type(problem).__name__}; allowed: a TrackingProblem")
+    problem: Problem = getattr(importlib.import_module(module), name)(**arguments)
+    if not isinstance(problem, tuple(KINDS)):
+        allowed = " or ".join(kind.__name__ for kind in KINDS)
+        raise ValueError(f"problem = {reference!r} makes a {type(problem).__name__}; allowed: a {allowed}")
     return problem
 
 
-def _units(plant: Plant) -> dict[str, float]:
-    components = {**plant.states, **plant.controls}
-    return {"time": plant.time.size} | {name: unit.size for name, unit in components.items()}
+def _units(problem: Problem) -> dict[str, float]:
+    return {name: unit.size for name, unit in problem.displayed.items()}
 
 
-def save_flight(flight: Flight, folder: Path, *, reference: str, arguments: Mapping[str, Any]) -> None:
+def _arrays(kind: type[Flown]) -> list[str]:
+    return [item.name for item in fields(kind) if item.name not in ("problem", "completed")]
+
+
+def save_flight(flight: Flown, folder: Path, *, reference: str, arguments: Mapping[str, Any]) -> None:
     """Write a flight of the problem that ``reference`` ("module:function") makes of JSON arguments."""
     folder.mkdir(parents=True, exist_ok=True)
-    plant = flight.problem.plant
     description = {
         "format": FORMAT,
         "version": __version__,
         "problem": {"reference": reference, "arguments": dict(arguments)},
         "completed": flight.completed,
-        "units": _units(plant),
+        "units": _units(flight.problem),
     }
     (folder / DESCRIPTION).write_text(json.dumps(description, indent=2, ensure_ascii=False) + "\n", encoding="utf-8")
     with (folder / ARRAYS).open("wb") as stream:
-        np.savez(stream, **{name: getattr(flight, name).numpy() for name in _FIELDS})
-    if flight.states.dim() == 2:
+        np.savez(stream, **{name: getattr(flight, name).numpy() for name in _arrays(type(flight))})
+    if flight.alone:
         _write_table(flight, folder / TABLE)
 
 
-def _write_table(flight: Flight, path: Path) -> None:
-    """One row per cycle in the units that people read."""
-    plant = flight.problem.plant
-    shown = {"t": plant.time} | dict(plant.states) | dict(plant.controls)
+def _write_table(flight: Flown, path: Path) -> None:
+    """The flight of one vehicle in the units that people read."""
+    shown = flight.problem.displayed
     with path.open("w", newline="", encoding="utf-8") as stream:
         writer = csv.writer(stream, lineterminator="\n")
         writer.writerow([f"{name} ({unit.label})" for name, unit in shown.items()])
         sizes = np.array([unit.size for unit in shown.values()])
         if flight.n_cycles:
-            rows = torch.cat([flight.times[:-1, None], flight.states[:-1], flight.controls], -1).numpy() / sizes
-            writer.writerows([[format(value, ".12g") for value in row] for row in rows])
+            writer.writerows([[format(value, ".12g") for value in row] for row in flight.rows.numpy() / sizes])
 
 
-def load_flight(folder: Path | str) -> Flight:
+def load_flight(folder: Path | str) -> Flown:
     """The flight again, its problem made anew.
 
     Raises:
@@ -84,10 +89,9 @@ def load_flight(folder: Path | str) -> Flight:
     if description.get("format") != FORMAT:
         raise ValueError(f"{folder / DESCRIPTION}: format = {description.get('format')!r}; allowed: {FORMAT}")
     problem = make_problem(description["problem"]["reference"], description["problem"]["arguments"])
-    plant = problem.plant
-    units = _units(plant)
-    with np.load(folder / ARRAYS, allow_pickle=False) as stream:
-        arrays = {name: torch.from_numpy(stream[name]) for name in _FIELDS}
+    kind, units = KINDS[type(problem)], _units(problem)
     if units != description["units"]:
-        raise ValueError(f"{folder / DESCRIPTION}: units = {description['units']}; allowed: {units} of {plant.name}")
-    return Flight(problem, **arrays, completed=bool(description["completed"]))
+        raise ValueError(f"{folder / DESCRIPTION}: units = {description['units']}; allowed: {units} of {problem.name}")
+    with np.load(folder / ARRAYS, allow_pickle=False) as stream:
+        arrays = {name: torch.from_numpy(stream[name]) for name in _arrays(kind)}
+    return kind(problem, **arrays, completed=bool(description["completed"]))  # type: ignore[arg-type]

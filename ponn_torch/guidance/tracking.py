@@ -194,6 +194,15 @@ class TrackingProblem:
                 f"allowed: at least one cycle, {self.cycle / self.plant.time.size:g}"
             )
 
+    @property
+    def name(self) -> str:
+        return self.plant.name
+
+    @property
+    def displayed(self) -> dict[str, DisplayUnit]:
+        """Component → unit of a flight's table: time, states, controls."""
+        return {"t": self.plant.time} | dict(self.plant.states) | dict(self.plant.controls)
+
     def terminal_offset(self, end: Tensor) -> Tensor | None:
         """s = −Sf xr of the condition λ(T) = Sf x(T) + s for a horizon that ends at the time ()."""
         if self.terminal_weight is None:

@@ -74,10 +74,11 @@ def accuracy_figure(flight: Flight, certificate: GuidanceCertificate) -> Figure:
     shown = (
         (certificate.off_node_residuals, ORANGE, "s", "residual between the nodes"),
         (certificate.control_errors, VERMILLION, "o", f"control against {certificate.oracle}"),
+        (certificate.iteration_errors, BLUE, "v", "control against the passes' limit"),
     )
     for values, colour, marker, label in shown:
-        ax.semilogy(at, values, color=colour, marker=marker, ms=3.5, lw=0.8, label=label)
-    ax.axhline(certificate.allowed, color=GREY, lw=0.8, ls=":")
+        ax.semilogy(at, torch.tensor(values).clamp_min(1e-18), color=colour, marker=marker, ms=3.5, lw=0.8, label=label)
+    ax.axhline(certificate.allowed.oracle, color=GREY, lw=0.8, ls=":")
     ax.set_ylabel("relative error, loss")
     ax.legend(loc="center left", bbox_to_anchor=(1.0, 0.5))
     return figure

@@ -5,13 +5,26 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 from types import TracebackType
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
-from ponn_torch.guidance.accuracy import GuidanceCertificate
 from ponn_torch.reporting.records import RECORDS, JsonLines
 
 if TYPE_CHECKING:
     from typing import Self
+
+
+class Judged(Protocol):
+    """What a flight was found to be worth: a certificate of any kind of flight."""
+
+    @property
+    def certified(self) -> bool: ...
+
+    @property
+    def verdict(self) -> str: ...
+
+    def to_dict(self) -> dict[str, Any]: ...
+
+    def to_text(self) -> str: ...
 
 
 class FlightRecorder:
@@ -49,13 +62,14 @@ class FlightRecorder:
             self._events.write(record, number)
         if self._progress and (number + 1) % max(1, self._n_cycles // 10) == 0:
             errors = "  ".join(f"{name} {value:.3g}" for name, value in record["error"].items())
+            passes = f"{record['passes']} pass(es)  " if "passes" in record else ""
             print(
                 f"cycle {number + 1:5}/{self._n_cycles}  t {record['time']:8.4g} {self._time_label}  "
-                f"{record['passes']} pass(es)  {1e3 * record['seconds']:6.2f} ms  errors: {errors}",
+                f"{passes}{1e3 * record['seconds']:6.2f} ms  errors: {errors}",
                 flush=True,
             )
 
-    def certificate(self, certificate: GuidanceCertificate) -> None:
+    def certificate(self, certificate: Judged) -> None:
         self._lines.write("certificate", **certificate.to_dict())
         if self._events is not None:
             told = {key: value for key, value in certificate.to_dict().items() if not isinstance(value, list)}

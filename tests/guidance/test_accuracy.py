@@ -12,7 +12,7 @@ from helpers import relative
 from test_expansion import solver
 
 from ponn_torch.ansatz.basis import GaussianRBF
-from ponn_torch.guidance.accuracy import ORACLES, certify, oracle_of
+from ponn_torch.guidance.accuracy import ORACLES, Allowed, certify, oracle_of
 from ponn_torch.guidance.closed_loop import Flight, fly
 from ponn_torch.guidance.controllers import HorizonController, Timetable, gain_schedule, timetable
 from ponn_torch.guidance.methods import Pseudospectral, RandomGaussians, TunedGaussians, first_horizon
@@ -53,7 +53,7 @@ def test_certificate_tells_a_true_error_from_a_loss() -> None:
     for n_nodes in (6, 10, 16):
         planner = Planner(problem, solver(n_nodes), Passes(1))
         flight = fly(problem, gain_schedule(planner, table), table, problem.initial)
-        found = certify(flight, planner, table, n_samples=3, allowed=2e-3)
+        found = certify(flight, planner, table, n_samples=3, allowed=Allowed(oracle=2e-3))
         assert found.cycles == [0, 10, 19]
         errors.append(found.largest_error)
         losses.append(max(found.losses))
