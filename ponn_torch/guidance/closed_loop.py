@@ -98,7 +98,7 @@ class Flight:
 
     def limits(self) -> dict[str, Tensor]:
         """The plant's limit functions at the start of each cycle, (C, ...): at most 1 where they are kept."""
-        return {name: of(self.states[:-1], self.controls) for name, of in self.problem.plant.limits.items()}
+        return {name: of(self.states[:-1], self.controls) for name, of in self.problem.flying.limits.items()}
 
 
 def fly(
@@ -115,13 +115,13 @@ def fly(
 ) -> Flight:
     """Fly from states (..., n) through all cycles of a timetable.
 
-    plant: what flies, by default the one that is planned with. generator: of the measurement noise. on_cycle: called
+    plant: what flies, by default the problem's own. generator: of the measurement noise. on_cycle: called
     after each cycle, outside the time that a deadline limits. An interrupt (Ctrl-C) ends the loop; what was flown is
     returned.
 
     Raises ValueError for noise that is not one number per state.
     """
-    loop, plant = loop or Loop(), plant or problem.plant
+    loop, plant = loop or Loop(), plant or problem.flying
     deviations = initial.new_tensor(list(loop.noise))
     if len(deviations) not in (0, problem.plant.n_states):
         raise ValueError(f"noise = {list(loop.noise)}; allowed: one per state, {', '.join(problem.plant.states)}")

@@ -10,14 +10,14 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from ponn_torch.numerics.runge_kutta import runge_kutta
-from ponn_torch.optimal_control.problem import DisplayUnit
+from ponn_torch.optimal_control.problem import DisplayUnit, nearest
 
 Dynamics = Callable[[Tensor, Tensor, Tensor], Tensor]
 
@@ -75,6 +75,24 @@ class Plant:
         for i in range(n_substeps):
             x = runge_kutta(lambda share, x, i=i: self.dynamics(x.new_tensor(t + (i + share) * h), x, u), x, h)  # type: ignore[misc]
         return x
+
+
+def deviations(flown: Mapping[str, Any] | None, **as_planned: Any) -> dict[str, Any] | None:
+    """Parameters of the plant that flies, those of the model where nothing else is given; None where nothing differs.
+
+    Raises ValueError for a parameter that the plant has not, and what is not a number or as many as are needed.
+    """
+    given = dict(flown or {})
+    for name, value in given.items():
+        if name not in as_planned:
+            raise ValueError(f"flown = {given}; {name!r} is none of the plant's, {nearest(name, as_planned)}")
+        count = len(as_planned[name]) if isinstance(as_planned[name], list) else None
+        numbers = [value] if count is None else value if isinstance(value, list | tuple) else []
+        if len(numbers) != (count or 1) or not all(isinstance(number, int | float) for number in numbers):
+            what = "a number" if count is None else f"a list of {count} numbers"
+            raise ValueError(f"flown = {given}; {name} is {what}")
+    found = as_planned | given
+    return None if found == as_planned else found
 
 
 # -- references --------------------------------------------------------------------------------------
@@ -167,9 +185,10 @@ class TrackingProblem:
 
     state_weight: Q (n, n). control_weight: t (...) → diagonal of R (..., m). terminal_weight: Sf (n, n), None for 0.
     horizon, cycle, final_time: how far a plan looks, how often it is made, when the run ends. initial: x (n,) of the
-    nominal run. dispersion: half-widths (n,) of uniform initial errors of a Monte Carlo.
+    nominal run. dispersion: half-widths (n,) of uniform initial errors of a Monte Carlo. flown: the plant that flies,
+    where it is not the one that is planned with.
 
-    Raises ValueError for times that are not positive and a horizon shorter than a cycle.
+    Raises ValueError for times that are not positive, a horizon shorter than a cycle, a flown plant of other states.
     """
 
     plant: Plant
@@ -183,8 +202,11 @@ class TrackingProblem:
     terminal_weight: Tensor | None = None
     dispersion: Tensor | None = None
     description: str = ""
+    flown: Plant | None = None
 
     def __post_init__(self) -> None:
+        if self.flown is not None and list(self.flown.states) != list(self.plant.states):
+            raise ValueError(f"flown has states {list(self.flown.states)}; allowed: {list(self.plant.states)}")
         for name in ("horizon", "cycle", "final_time"):
             if not getattr(self, name) > 0:
                 raise ValueError(f"{name} = {getattr(self, name)}; allowed: above 0")
@@ -197,6 +219,11 @@ class TrackingProblem:
     @property
     def name(self) -> str:
         return self.plant.name
+
+    @property
+    def flying(self) -> Plant:
+        """What flies."""
+        return self.flown or self.plant
 
     @property
     def displayed(self) -> dict[str, DisplayUnit]:
