@@ -1,4 +1,4 @@
-"""Clohessy–Wiltshire: four horizons, the shortest that settles, the gain against the matrix exponential."""
+"""Clohessy–Wiltshire: four horizons, the shortest that settles, the exact gain; integral action under a push."""
 
 from __future__ import annotations
 
@@ -64,3 +64,36 @@ def run() -> Report:
             found = certify(flight, planner, table, allowed=Allowed(oracle=1e-10))
             save(accuracy_figure(flight, found), RESULTS / "rendezvous_accuracy.png", dpi=90)
     return Report({"rendezvous": rows}, markdown(rows), measured)
+
+
+def run_integral() -> Report:
+    """Station keeping under a constant push that the model does not know, for a growing weight of the integrals."""
+    rows, measured = [], {}
+    for weight in (0.0, 1e3, 1e5, 1e7, 1e12):
+        problem = clohessy_wiltshire(
+            initial_position=(100.0, 50.0, 50.0),
+            initial_velocity=(0.0, 0.0, 0.0),
+            final_time=4000.0,
+            integral_weight=weight,
+            flown={"disturbance": [1e-3, -1e-3, 5e-4]},
+        )
+        planner, table = Planner(problem, chebyshev(), Passes(1)), timetable(problem, "extend")
+        flight = fly(problem, gain_schedule(planner, table), table, problem.initial)
+        distance = in_units(flight.states, problem)[:, :3].norm(dim=-1)
+        last = 10.0 * (int((distance > 1.0).nonzero().max()) + 1)
+        found = certify(flight, planner, table, n_samples=10, allowed=Allowed(oracle=1e-9))
+        controls = in_units(flight.controls, problem, "controls")
+        rows.append(
+            {
+                "weight": f"{weight:g}",
+                "distance at 4000 s, m": f"{float(distance[-1]):.2e}",
+                "within 1 m from, s": f"{last:.0f}" if last <= 4000 else "–",
+                "Δv m/s": f"{float(controls.norm(dim=-1).sum()) * 10:.2f}",
+                "u0 against matrix exponential": f"{found.largest_error:.1e}",
+            }
+        )
+        measured |= {
+            f"integral/weight {weight:g} distance": float(distance[-1]),
+            f"integral/weight {weight:g} u0": found.largest_error,
+        }
+    return Report({"integral": rows}, markdown(rows), measured)

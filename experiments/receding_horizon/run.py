@@ -14,6 +14,7 @@ from experiments.tables import run_study
 FOLDER = Path(__file__).parent
 PARTS = {
     "rendezvous": rendezvous.run,
+    "integral": rendezvous.run_integral,
     "costs": quadrotor.run_costs,
     "tolerance": quadrotor.run_tolerance,
     "passes": quadrotor.run_passes,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from itertools import product
 
 import torch
 from torch import Tensor
@@ -22,7 +23,15 @@ from ponn_torch.reporting.flight_figures import limits_figure, tracking_figure
 from ponn_torch.reporting.style import save
 
 N_RUNS = 500
+FIRST = 200  # cycles, in which the heat rate peaks
 EVERY = 25  # cycles between those of which the loss is taken
+
+
+def _peaks(problem: TrackingProblem, planner: Planner, table: Timetable, starts: Tensor) -> float:
+    """The largest heat rate in the first minutes, in which it peaks, over its limit."""
+    first = Timetable(table.starts[:FIRST], table.durations[:FIRST])
+    flight = fly(problem, gain_schedule(planner, first, with_loss=False), first, starts)
+    return float(flight.limits()["heat rate"].max())
 
 
 def run_monte_carlo() -> Report:
@@ -44,6 +53,10 @@ def run_monte_carlo() -> Report:
         differences.append(float((decision.control - flight.controls[k]).abs().max()))
     last = in_units(flight.errors[-1], problem).abs().amax(0).tolist()
     peaks = {name: float(values.max()) for name, values in flight.limits().items()}
+    draws = [problem.disperse(N_RUNS, torch.Generator().manual_seed(seed)) for seed in range(8)]
+    heat = torch.tensor([_peaks(problem, planner, table, drawn) for drawn in draws])
+    start = problem.reference(torch.zeros((), dtype=torch.float64))[0]
+    corners = torch.tensor(list(product((-1.0, 1.0), repeat=3)), dtype=torch.float64)
     nominal = fly(problem, gain_schedule(planner, table, with_loss=False), table, problem.initial)
     save(tracking_figure(nominal, flight), RESULTS / "shuttle_tracking.png", dpi=90)
     limits = limits_figure(nominal, flight)
@@ -54,6 +67,10 @@ def run_monte_carlo() -> Report:
         "monte_carlo/final radius m": last[0],
         "monte_carlo/final speed m/s": last[1],
         "monte_carlo/heat rate": peaks["heat rate"],
+        "monte_carlo/heat rate, median of eight draws": float(heat.median()),
+        "monte_carlo/heat rate, smallest of eight draws": float(heat.min()),
+        "monte_carlo/heat rate, largest errors": _peaks(problem, planner, table, start + corners * problem.dispersion),
+        "monte_carlo/heat rate, no errors": _peaks(problem, planner, table, start[None]),
         "monte_carlo/loss": max(losses),
         "monte_carlo/schedule against horizons": max(differences),
         "monte_carlo/CPU seconds": seconds,
