@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import statistics
 import time
+from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cache
 
@@ -71,7 +73,7 @@ class Found:
 
     @property
     def median(self) -> float:
-        return float(torch.tensor(self.errors).median())
+        return statistics.median_low(self.errors)
 
 
 def _judge(problem: TrackingProblem, solver: HorizonSolver) -> Found:
@@ -86,7 +88,7 @@ def _judge(problem: TrackingProblem, solver: HorizonSolver) -> Found:
         errors.append(error if error == error else float("inf"))
         residuals.append(float(plan.solution.off_node_residual()))
     loss = float(flight.loss.nan_to_num(nan=torch.inf).max())
-    return Found(loss, float(flight.errors[-1].norm()), float(torch.tensor(residuals).median()), errors)
+    return Found(loss, float(flight.errors[-1].norm()), statistics.median_low(residuals), errors)
 
 
 def run_six() -> Report:
@@ -96,22 +98,25 @@ def run_six() -> Report:
     for name, method in METHODS.items():
         seeds = SEEDS.get(name, range(1))
         found = [_judge(problem, method.solver(problem, seed)) for seed in seeds]
-        medians = torch.tensor([one.median for one in found])
         stays = [one for one in found if one.median < 1.0]
+
+        def told(values: Iterable[float], form: str = ".1e", many: bool = len(found) > 1) -> str:
+            return spread(values, form) if many else format(*values, form)
+
         rows.append(
             {
                 "method": name,
                 "seeds": len(found),
-                "largest loss of its flight": spread((one.loss for one in found), ".1e"),
-                "off-node residual, median": spread((one.residual for one in found), ".1e"),
-                "u0 error, median": spread((one.median for one in found), ".1e"),
-                "largest": spread((max(one.errors) for one in found), ".1e"),
-                "‖error‖ at the end": spread((one.end for one in found), ".2f"),
+                "largest loss of its flight": told((one.loss for one in found), ".1e"),
+                "off-node residual, median": told((one.residual for one in found), ".1e"),
+                "u0 error, median": told((one.median for one in found), ".1e"),
+                "largest": told((max(one.errors) for one in found), ".1e"),
+                "‖error‖ at the end": told((one.end for one in found), ".2f"),
             }
         )
         measured |= {
-            f"methods/{name} loss": float(torch.tensor([one.loss for one in found]).median()),
-            f"methods/{name} u0": float(medians.median()),
+            f"methods/{name} loss": statistics.median_low([one.loss for one in found]),
+            f"methods/{name} u0": statistics.median_low([one.median for one in found]),
             f"methods/{name} converging share": len(stays) / len(found),
         }
         single += [

@@ -113,7 +113,7 @@ def run_tolerance() -> Report:
 
 
 def run_passes() -> Report:
-    """Table 4: what the last of κ passes changed at all nodes of all horizons of a flight; the largest component's norm."""
+    """Table 4: what the last of κ passes changed, at all nodes of all horizons; the largest norm of a component."""
     problem = displaced(-10.0)
     rows, measured = [], {}
     for kappa, known in TABLE_4.items():

@@ -47,6 +47,7 @@ Examples
   ponn-rhc problem=quadrotor passes=newton            a manoeuvre, Newton's method on every horizon
   ponn-rhc problem=shuttle n_vehicles=500             entry, and a Monte Carlo of 500 vehicles
   ponn-rhc problem=quadrotor method=rbf_swarm         Gaussians tuned by a particle swarm
+  ponn-rhc problem=quadrotor problem.flown.thrust=0.95   a true vehicle that is not the model's
   ponn-rhc problem=powered_descent n_vehicles=200     fuel-optimal descents planned anew every second
   ponn-rhc problem.horizon=70 ending=shrink           other data
   ponn-rhc -m method=chebyshev,igpm,rbf               a sweep

@@ -270,7 +270,9 @@ def land(
                 h = left.clamp(0.0, how.step)[:, None]
                 law.measured(estimate, t, left, (left > how.blind) | (t == 0.0))
                 at, planning = t + h * fractions, (fleet.switches_ahead(t) > 0)[:, None, None]
-                thrust = torch.where(planning, fleet.thrust(at), law.thrust(fleet, at, estimate[:, 6:]))
+                thrust = law.thrust(fleet, at, estimate[:, 6:])
+                if bool(planning.any()):
+                    thrust = torch.where(planning, fleet.thrust(at), thrust)
                 law.flown(h, thrust, estimate[:, 6:])
                 x = lander.fly(x, thrust, h, factors[:, None])
                 expected = lander.fly(estimate, thrust, h, law.factor)

@@ -39,11 +39,11 @@ def test_oracles_agree_with_each_other_and_with_many_nodes() -> None:
     lengths = [problem.horizon, problem.horizon / 2]
     states = torch.stack([problem.initial, 0.5 * problem.initial])
     exact, swept = (ORACLES[name](planner, [0.0, 0.1], lengths, states) for name in list(ORACLES)[:2])
-    assert relative(swept, exact) < 1e-9
+    assert relative(swept, exact) < 1e-10
     problem = quadrotor()
     planner = Planner(problem, solver(24), Passes(1))
     swept = ORACLES["Riccati sweep"](planner, [0.0], [problem.horizon], problem.initial[None])[0]
-    assert relative(planner.plan(0.0, problem.initial).control, swept) < 1e-5
+    assert relative(planner.plan(0.0, problem.initial).control, swept) < 5e-6  # of 24 nodes
 
 
 def test_certificate_tells_a_true_error_from_a_loss() -> None:
@@ -60,7 +60,7 @@ def test_certificate_tells_a_true_error_from_a_loss() -> None:
         assert found.certified is (n_nodes > 6)
         assert ("not certified" in found.verdict) is (n_nodes == 6)
     assert errors[0] > 10 * errors[1] > 100 * errors[2]
-    assert max(losses) < 1e-9  # whatever the basis is worth
+    assert max(losses) < 4e-10  # whatever the basis is worth
     text = found.to_text()
     assert "Riccati sweep" in text
     assert json.loads(json.dumps(found.to_dict()))["median_error"] == found.median_error
@@ -84,8 +84,8 @@ def test_swarm_that_minimises_round_off_finds_noise_and_an_honest_one_does_not()
         plan = planner.plan(0.0, problem.initial)
         truth = ORACLES["matrix exponential"](planner, [0.0], [problem.horizon], problem.initial[None])[0]
         results[objective] = float(plan.solution.loss), relative(plan.control, truth)
-    assert results["loss"][0] < 1e-12
-    assert results["off_node_residual"][0] < 1e-9
+    assert results["loss"][0] < 1e-13
+    assert results["off_node_residual"][0] < 1e-12
     assert results["loss"][1] > 5 * results["off_node_residual"][1]
     with pytest.raises(ValueError, match=r"objective = 'los'; allowed: loss, off_node_residual"):
         TunedGaussians(objective="los")
@@ -107,7 +107,7 @@ def test_random_and_pseudospectral_methods() -> None:
     radau = Pseudospectral("legendre_radau").solver(problem, 0)
     planner = Planner(problem, radau, Passes(1))
     truth = ORACLES["matrix exponential"](planner, [0.0], [problem.horizon], problem.initial[None])[0]
-    assert relative(planner.plan(0.0, problem.initial).control, truth) < 1e-10
+    assert relative(planner.plan(0.0, problem.initial).control, truth) < 1e-11
 
 
 # -- storage -----------------------------------------------------------------------------------------

@@ -39,11 +39,11 @@ def test_undisturbed_the_plan_is_flown_to_its_switch_and_lands(planned: Solution
     one = torch.ones(1, dtype=torch.float64)
     records: list[Mapping[str, Any]] = []
     flown = land(DESCENT, planned, DESCENT.initial[None], one, how=CALM, on_cycle=records.append)
-    assert float((flown.arrival - planned.final_time).abs().max()) < 1e-6
-    assert float(flown.miss.max()) < 0.05
-    assert float(flown.impact.max()) < 0.05
+    assert float((flown.arrival - planned.final_time).abs().max()) < 1e-9
+    assert float(flown.miss.max()) < 5e-3
+    assert float(flown.impact.max()) < 2e-3
     # the last arc's acceleration is linear in time, not the plan's: nearly the same fuel
-    assert float((flown.fuel / planned.cost - 1).abs().max()) < 5e-3
+    assert float((flown.fuel / planned.cost - 1).abs().max()) < 1e-3
     assert flown.n_kept.sum() == flown.n_repaired.sum() == flown.n_late.sum() == 0
     assert flown.n_plans.tolist() == [7]
     assert len(flown.seconds_per_plan) == 7
@@ -67,16 +67,16 @@ def test_undisturbed_the_plan_is_flown_to_its_switch_and_lands(planned: Solution
 
 
 def test_disturbed_landers_land_by_the_law_of_the_last_arc(planned: Solution) -> None:
-    states, factors = dispersed(DESCENT, Replanning(), 8, seeded(3))
+    states, factors = dispersed(DESCENT, Replanning(), 5, seeded(3))
     assert float(states[:, :3].std(0).min()) > 5
-    flown = land(DESCENT, planned, states, factors, generator=seeded(1))
+    flown = land(DESCENT, planned, states, factors, how=Replanning(step=0.2), generator=seeded(1))
     assert float(flown.miss.max()) < 1.0
     assert float(flown.impact.max()) < 0.1
     found = certify_landing(flown, {"planned": 0.0, "optimal": 0.0}, flown, n_samples=0)
-    assert (found.n_landed, found.n_landers, found.share) == (8, 8, 1.0)
+    assert (found.n_landed, found.n_landers, found.share) == (5, 5, 1.0)
     assert found.peak_thrust <= 1.0 + 1e-12
     # planned less often, the last plan followed to its end: what the law is for
-    how = Replanning(cycle=4.0, last_arc="plan")
+    how = Replanning(cycle=4.0, step=0.25, last_arc="plan")
     by_plan = land(DESCENT, planned, states, factors, how=how, generator=seeded(1))
     assert float(by_plan.miss.min()) > 1.0
 

@@ -105,7 +105,7 @@ def test_expansion_is_the_first_order_of_the_state_costate_system(name: str) -> 
         move = torch.zeros_like(y)
         move[..., column] = step
         slope = (rates(y + move) - rates(y - move)) / (2 * step)
-        assert relative(made.matrix[..., column], slope) < 1e-6
+        assert relative(made.matrix[..., column], slope) < 1e-7
 
 
 def test_clohessy_wiltshire_gain_is_that_of_the_matrix_exponential() -> None:
@@ -118,7 +118,7 @@ def test_clohessy_wiltshire_gain_is_that_of_the_matrix_exponential() -> None:
         end = (problem.terminal_weight, torch.zeros(6, dtype=torch.float64))
         gain, _ = exponential_gain(made.matrix[0], made.drift[0], problem.horizon, *end)
         expected = made.control_gain[0, :, 6:] @ gain @ problem.initial
-        assert relative(plan.control, expected) < 1e-10
+        assert relative(plan.control, expected) < 1e-11
 
 
 # -- passes ------------------------------------------------------------------------------------------
@@ -146,7 +146,7 @@ def test_newton_needs_six_passes_where_quasi_linearisation_needs_twenty(displace
     )
     assert newton.passes <= 6
     assert 18 <= quasi.passes <= 22
-    assert relative(newton.control, quasi.control) < 1e-10
+    assert relative(newton.control, quasi.control) < 1e-11
     ratios = [float(b / a) for a, b in zip(quasi.changes[3:-2], quasi.changes[4:-1], strict=True)]
     assert all(0.15 < ratio < 0.45 for ratio in ratios)  # linear, as a fixed-point iteration is
 
@@ -159,7 +159,7 @@ def test_newton_reaches_the_nonlinear_oracle() -> None:
     assert relative(plan.control, truth) < 5e-6
     coarse = Planner(problem, solver(), Passes(20, 1e-9, True)).plan(0.0, problem.initial)
     assert 1e-5 < relative(coarse.control, truth) < 1e-3  # what ten nodes are worth, whatever their loss
-    assert coarse.solution.loss < 1e-9
+    assert coarse.solution.loss < 2e-10
 
 
 @pytest.mark.parametrize("kind", ["legendre_gauss", "legendre_radau"])
@@ -168,7 +168,7 @@ def test_a_start_that_is_no_node_gets_its_own_control(kind: str) -> None:
     planner = Planner(problem, solver(24, kind), Passes(20, 1e-9, True))
     plan = planner.plan(0.0, problem.initial)
     assert plan.points[0] == -1.0
-    assert plan.control.tolist() == pytest.approx((18.378603, 16.427465), abs=1e-4)
+    assert plan.control.tolist() == pytest.approx((18.378603, 16.427465), abs=4e-5)  # solve_bvp; what 24 nodes leave
     assert plan.states[0].tolist() == pytest.approx(problem.initial.tolist(), abs=1e-9)
 
 
@@ -182,7 +182,7 @@ def test_traces_are_what_was_traced_and_warm_starts_save_passes(second_order: bo
     moved = problem.plant.fly(0.0, problem.initial, first.control, problem.cycle, 2)
     cold, warm = plain.plan(problem.cycle, moved), plain.plan(problem.cycle, moved, last=first)
     assert warm.passes < cold.passes
-    assert relative(warm.control, cold.control) < 1e-5
+    assert relative(warm.control, cold.control) < 1e-7
 
 
 def test_batch_of_vehicles_is_planned_as_one_by_one() -> None:
@@ -192,7 +192,7 @@ def test_batch_of_vehicles_is_planned_as_one_by_one() -> None:
     together = planner.plan(0.0, starts)
     assert together.solution.loss.shape == (3,)
     for i, start in enumerate(starts):
-        assert relative(together.control[i], planner.plan(0.0, start).control) < 1e-8
+        assert relative(together.control[i], planner.plan(0.0, start).control) < 1e-11
 
 
 def test_a_plan_that_diverges_ends_and_says_so() -> None:

@@ -27,7 +27,8 @@ from ponn_torch.optimal_control.problem import OptimalControlProblem
 ENDS = torch.tensor([-1.0, 1.0], dtype=torch.float64)
 EMBEDDED = [name for name, solver in SOLVERS.items() if solver.embedded]
 # what the paper's bases reach on this horizon with 12 functions; polynomials reach round-off
-DIGITS = {"rbf": 1e-6, "elm": 1e-6, "chebyshev_qr": 1e-9}
+DIGITS = {"rbf": 2e-8, "elm": 5e-9, "chebyshev_qr": 1e-11}
+LOSSES = {"rbf": 5e-7, "chebyshev_qr": 5e-9}  # round-off of ill-conditioned tables; least squares of what is left
 
 
 def oracle(problem: LinearTPBVP) -> Tensor:
@@ -67,9 +68,9 @@ def test_costate_at_the_start_is_the_matrix_exponentials(name: str, seed: int) -
     solver = SOLVERS[name]
     problem = problem_of(solver, seed=seed)
     solution = solver.solve(problem)
-    assert relative(solution.values(ENDS)[0, 3:], oracle(problem)) < DIGITS.get(name, 1e-11)
-    assert solution.loss < 1e-6
-    assert solution.off_node_residual() < 1e4 * DIGITS.get(name, 1e-12)
+    assert relative(solution.values(ENDS)[0, 3:], oracle(problem)) < DIGITS.get(name, 1e-12)
+    assert solution.loss < LOSSES.get(name, 1e-11)
+    assert solution.off_node_residual() < 1e3 * DIGITS.get(name, 1e-14)
     assert solution.condition > 1
 
 
@@ -78,8 +79,8 @@ def test_lobatto_pseudospectral_method_is_over_determined() -> None:
     solution = solver.solve(problem_of(solver))
     rows, columns = solution.matrix.shape
     assert rows == columns + 6
-    assert solution.loss > 1e-6  # nothing is met exactly
-    assert relative(solution.values(ENDS)[0, 3:], oracle(solution.problem)) < 1e-2
+    assert solution.loss > 1e-4  # nothing is met exactly
+    assert relative(solution.values(ENDS)[0, 3:], oracle(solution.problem)) < 1e-5
 
 
 @pytest.mark.parametrize("kind", ["legendre_radau", "legendre_gauss"])
@@ -96,8 +97,8 @@ def test_low_loss_is_no_accuracy() -> None:
     poor = HorizonSolver(Chebyshev(4, 1), make_nodes("legendre_lobatto", 4))
     solution = poor.solve(problem_of(poor, 6.0))
     assert solution.loss < 1e-12
-    assert solution.off_node_residual() > 1e-3
-    assert relative(solution.values(ENDS)[0, 3:], oracle(solution.problem)) > 1e-4
+    assert solution.off_node_residual() > 1e-2
+    assert relative(solution.values(ENDS)[0, 3:], oracle(solution.problem)) > 1e-3
 
 
 # -- routes ------------------------------------------------------------------------------------------
@@ -134,7 +135,7 @@ def test_batch_is_one_by_one(name: str) -> None:
     for i, problem in enumerate(problems):
         alone = solver.solve(problem)
         # bases whose matrix has few digits give other digits in another order of operations
-        assert relative(together.at_nodes[i], alone.at_nodes) < DIGITS.get(name, 1e-11)
+        assert relative(together.at_nodes[i], alone.at_nodes) < DIGITS.get(name, 1e-12)
 
 
 def test_affine_relation_gives_values_anywhere() -> None:
@@ -155,7 +156,7 @@ def test_particles_are_solved_at_once_and_fail_alone() -> None:
     assert solution.off_node_residual().isfinite().tolist() == [True, False, True]
     assert solution.condition.isfinite().tolist() == [True, False, True]
     alone = HorizonSolver(GaussianRBF(N, 1.3), nodes)
-    assert relative(solution.at_nodes[2], alone.solve(problem_of(alone)).at_nodes) < 1e-8
+    assert relative(solution.at_nodes[2], alone.solve(problem_of(alone)).at_nodes) < 1e-10
 
 
 def test_wrong_settings_are_named() -> None:
@@ -182,7 +183,7 @@ def test_riccati_sweep_converges_to_the_matrix_exponential_with_order_four() -> 
         end = (problem.terminal_matrix, problem.terminal_offset)
         gain, offset = riccati_sweep(lambda t: (problem.matrix[0], problem.drift[0]), times, *end)
         errors.append(relative(gain @ problem.initial + offset, oracle(problem)))
-    assert errors[0] < 1e-5
+    assert errors[0] < 1e-7
     assert 12 < errors[0] / errors[1] < 20
 
 
@@ -196,7 +197,7 @@ def test_riccati_sweep_reads_the_clock() -> None:
     half = torch.full((1, 1), 0.5, dtype=torch.float64)
     times = torch.linspace(0.0, 1.0, 101, dtype=torch.float64)
     gain, _ = riccati_sweep(system, times, half, half[0] * 0)
-    assert relative(gain, torch.ones_like(gain)) < 1e-8
+    assert relative(gain, torch.ones_like(gain)) < 2e-9
 
 
 def test_one_gauss_newton_step_of_the_general_residual_gives_the_same_curve() -> None:
@@ -226,4 +227,4 @@ def test_one_gauss_newton_step_of_the_general_residual_gives_the_same_curve() ->
     z = solver.nodes.points
     _, scaled, _ = Curve(residual, step).on_segment(z, 0)
     states, costates = residual.bvp.to_physical(scaled)
-    assert relative(solver.solve(given).values(z), torch.cat([states, costates], -1)) < 1e-11
+    assert relative(solver.solve(given).values(z), torch.cat([states, costates], -1)) < 1e-13

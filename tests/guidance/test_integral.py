@@ -50,15 +50,15 @@ def test_plain_tracking_comes_to_rest_where_its_gain_balances_the_push() -> None
     a, b = jacobian[0, :, :6], jacobian[0, :, 6:]
     push = torch.tensor([0.0] * 3 + PUSH, dtype=torch.float64) * problem.plant.controls["a1"].size
     rest = torch.linalg.solve(a + b @ schedule.gain[0], -push)
-    assert relative(flight.states[-1], rest) < 1e-3
+    assert relative(flight.states[-1], rest) < 1e-6
     assert float(distance(flight)[-1]) == pytest.approx(25.26, abs=0.01)
 
 
-@pytest.mark.parametrize(("weight", "allowed"), [(1e6, 1e-3), (1e7, 1e-9)])
-def test_integral_action_leaves_no_error_at_rest(weight: float, allowed: float) -> None:
+@pytest.mark.parametrize("weight", [1e6, 1e7])
+def test_integral_action_leaves_no_error_at_rest(weight: float) -> None:
     problem = station_keeping(weight)
     flight, _ = flown(problem)
-    assert float(distance(flight)[-1]) < allowed  # m, of 25
+    assert float(distance(flight)[-1]) < 1e-9  # m, of 25
     table = timetable(problem, "extend")
     found = certify(flight, Planner(problem, solver(), Passes(1)), table, n_samples=4, allowed=Allowed(1e-9))
     assert found.certified, found.verdict
