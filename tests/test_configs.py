@@ -116,6 +116,7 @@ def test_known_optimum_belongs_to_the_published_data(problem: str, cost: float, 
 
 
 TINY = [
+    "explain=false",  # of runs that are cut short there is nothing to explain
     "n_starts=1",
     "start_limit=1e9",
     "ansatz=legendre",
@@ -144,6 +145,8 @@ INSTEAD = {
     "split": ["refinement.max_rounds=1", "refinement.stopping.max_iterations=2"],
     "two_loop": ["refinement.max_rounds=1", "refinement.stopping.max_iterations=2"],
     "split_mlp": ["refinement.max_rounds=1", "refinement.max_sharpenings=0", "refinement.stopping.max_iterations=2"],
+    "enrichment": ["refinement.last=0.5"],
+    "switch_neurons": ["refinement.last=0.5"],
     "subdivide": ["refinement.max_rounds=1", "refinement.stopping.max_iterations=2"],
     **NEEDED,
     "adam_lbfgs": [f"optimizer.parts.{i}.stopping.max_iterations=2" for i in (0, 1)],
@@ -170,6 +173,12 @@ def tiny(group: str, option: str) -> list[str]:
             chosen.pop(key, None)
         chosen |= {"continuation": "continuation=single", "nodes.n_nodes": "nodes.n_nodes=16"}
         chosen["ansatz.size"] = "ansatz.size=8"
+        refinement = composed([f"experiment={option}"]).get("refinement") or {}
+        for key, value in (("last", 0.5), ("max_rounds", 1), ("n_neurons", 20)):
+            if key in refinement:
+                chosen[f"refinement.{key}"] = f"refinement.{key}={value}"
+        if "stopping" in refinement:
+            chosen["refinement.stopping"] = "refinement.stopping.max_iterations=2"
     elif group == "ansatz":
         chosen.pop("ansatz.size")
     for text in [f"{group}={option}", *INSTEAD.get(group, []), *INSTEAD.get(option, [])]:

@@ -58,7 +58,7 @@ def tiny(group: str, option: str) -> list[str]:
         chosen += ["method.swarm.n_iterations=2", "method.swarm.n_particles=4"]
     if group != "problem":
         chosen += ["problem.final_time=40", "problem.horizon=100"]
-    elif option == "clohessy_wiltshire":
+    elif option in ("clohessy_wiltshire", "station_keeping"):
         chosen += ["problem.final_time=40"]
     else:
         chosen += ["problem.horizon=5.85" if option == "quadrotor" else "problem.horizon=2270"]

@@ -73,7 +73,7 @@ class Found:
 
     @property
     def median(self) -> float:
-        return statistics.median_low(self.errors)
+        return statistics.median(self.errors)
 
 
 def _judge(problem: TrackingProblem, solver: HorizonSolver) -> Found:
@@ -88,7 +88,7 @@ def _judge(problem: TrackingProblem, solver: HorizonSolver) -> Found:
         errors.append(error if error == error else float("inf"))
         residuals.append(float(plan.solution.off_node_residual()))
     loss = float(flight.loss.nan_to_num(nan=torch.inf).max())
-    return Found(loss, float(flight.errors[-1].norm()), statistics.median_low(residuals), errors)
+    return Found(loss, float(flight.errors[-1].norm()), statistics.median(residuals), errors)
 
 
 def run_six() -> Report:
@@ -115,8 +115,8 @@ def run_six() -> Report:
             }
         )
         measured |= {
-            f"methods/{name} loss": statistics.median_low([one.loss for one in found]),
-            f"methods/{name} u0": statistics.median_low([one.median for one in found]),
+            f"methods/{name} loss": statistics.median([one.loss for one in found]),
+            f"methods/{name} u0": statistics.median([one.median for one in found]),
             f"methods/{name} converging share": len(stays) / len(found),
         }
         single += [

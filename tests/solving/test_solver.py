@@ -140,7 +140,13 @@ def solved(name: str, seed: int = 0) -> SolveResult:
     return Solver(guess=guess).solve(problem(name), seed)
 
 
-@pytest.mark.parametrize("name", ANSWERS)
+# the same solve is held against single shooting in tests/problems/test_steering.py
+ALSO_SHOT = ("orbit_raising",)
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=[pytest.mark.slow] if name in ALSO_SHOT else []) for name in ANSWERS]
+)
 def test_published_problems_are_solved_to_their_answers(name):
     result, answer = solved(name), ANSWERS[name]
     assert result.certified, result.message
