@@ -21,13 +21,19 @@ from ponn_torch.guidance.storage import load_flight
 from ponn_torch.settings import ROOMS, target
 
 ROOT = CONFIGS / "rhc"
-CHOSEN_BY_OTHERS = {("flight", "landing"), ("replanning", "default"), ("flight", "tracking")}  # flown with a problem
+# flown with another config, or below
+FLOWN_ELSEWHERE = {
+    ("flight", "tracking"),
+    ("flight", "landing"),
+    ("replanning", "default"),
+    ("problem", "powered_descent"),
+}
 OPTIONS = sorted((path.parent.name, path.stem) for path in ROOT.glob("*/*.yaml") if path.parent.name != "hydra")
 LONG = {("problem", "powered_descent_three_arcs"), ("replanning", "undisturbed")}  # seconds, and one landing is enough
 FLOWN = [
     pytest.param(*pair, marks=[pytest.mark.slow] if pair in LONG else [], id="-".join(pair))
     for pair in OPTIONS
-    if pair not in CHOSEN_BY_OTHERS
+    if pair not in FLOWN_ELSEWHERE
 ]
 
 
@@ -120,6 +126,34 @@ def test_a_run_leaves_everything(tmp_path: Path, capsys: pytest.CaptureFixture[s
     assert "3 vehicles" in said
     assert "matrix exponential" in said
     assert not (tmp_path / "failure.txt").exists()
+
+
+def test_a_landing_leaves_everything(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    overrides = ["problem=powered_descent", "n_vehicles=2", "n_samples=1", "replanning.cycle=3", "replanning.step=0.2"]
+    outcome = run(composed(*overrides), tmp_path, overrides)
+    assert outcome.exit_code == 0, outcome.message
+    assert outcome.certified
+    assert outcome.cost == pytest.approx(182.4, abs=0.5)  # kg
+    lines = [json.loads(line) for line in (tmp_path / "records.jsonl").read_text(encoding="utf-8").splitlines()]
+    assert [line["event"] for line in lines[-3:]] == ["cycle", "certificate", "monte_carlo"]
+    assert set(lines[0]["error"]) == {"distance", "speed"}
+    assert (lines[-1]["n_vehicles"], lines[-1]["n_landed"]) == (2, 2)
+    certificate = json.loads((tmp_path / "certificate.json").read_text(encoding="utf-8"))
+    assert certificate["largest_error"] < 1e-8
+    assert certificate["planned_fuel"] - certificate["optimal_fuel"] == pytest.approx(3.01, abs=0.01)
+    report = (tmp_path / "report.md").read_text(encoding="utf-8")
+    for name in ("trajectory", "thrust", "dispersion", "timing"):
+        assert (tmp_path / "figures" / f"{name}.png").is_file()
+        assert f"figures/{name}.png" in report
+    assert "2 landers: least" in report
+    assert len(load_flight(tmp_path / "monte_carlo")) == 2
+    flight = load_flight(tmp_path / "flight")
+    assert flight.completed
+    events = EventAccumulator(str(tmp_path))
+    events.Reload()
+    assert len(events.Scalars("error/distance")) == flight.n_cycles
+    assert events.Scalars("certificate/certified")[-1].value == 1.0
+    assert "2 of 2 dispersed ones" in capsys.readouterr().out
 
 
 def test_a_poor_basis_is_not_certified(tmp_path: Path) -> None:
