@@ -98,20 +98,21 @@ class Settings:
             raise ConfigError(f"{key} = {value}; allowed: an integer from {least}")
         return value
 
-    def group(self, key: str) -> dict[str, Any]:
+    def group(self, key: str, without: Sequence[str] = ()) -> dict[str, Any]:
+        """A group's config ``without`` what is there for the flight to refer to."""
         value = self.node.pop(key, None)
         self.used.append(key)
         if not isinstance(value, dict):
             raise ConfigError(f"{key} = {value!r}; allowed: a config of the group {key}")
-        return dict(value)
+        return {name: entry for name, entry in value.items() if name not in without}
 
     def common(self, settings: dict[str, Any]) -> Common:
         recording = call(FlightRecording, self.group("record"), "record")
         return Common(settings, self.value("seed", int, 0), self.value("threads", int, 1), recording)
 
-    def plant(self, kind: type[P], only_config: Sequence[str] = ()) -> tuple[P, str, dict[str, Any]]:
-        """The problem, the reference and arguments that make it again; ``only_config`` are settings of the flight."""
-        node = {name: value for name, value in self.group("problem").items() if name not in ("name", *only_config)}
+    def plant(self, kind: type[P], without: Sequence[str] = ()) -> tuple[P, str, dict[str, Any]]:
+        """The problem, and the reference and arguments that make it again."""
+        node = self.group("problem", ("name", *without))
         function = target(node.pop("_target_", None), "problem._target_", PLANTS)
         arguments = arguments_of(function, node, "problem")
         reference = f"{function.__module__}:{function.__name__}"

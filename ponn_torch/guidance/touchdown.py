@@ -9,14 +9,14 @@ from __future__ import annotations
 import math
 import statistics
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import torch
 
 from ponn_torch.guidance.accuracy import spread_evenly
 from ponn_torch.guidance.descent import Landing, PoweredDescent
-from ponn_torch.optimal_control.problem import FreeTime
+from ponn_torch.optimal_control.problem import FreeTime, OptimalControlProblem
 from ponn_torch.solving.solver import Solver
 
 ORACLE = "cold split"
@@ -195,9 +195,8 @@ def _off(flight: Landing, cycle: int, solver: Solver) -> float:
     return float((command - truth).norm() / truth.norm())
 
 
-def _from(descent: PoweredDescent, state: torch.Tensor, left: float) -> Any:
+def _from(descent: PoweredDescent, state: torch.Tensor, left: float) -> OptimalControlProblem:
     """The planned problem from another state, with about so much time left."""
     problem = descent.planned
     initial = {name: state[where].tolist() for name, where in problem.slices.items()}
-    initial["m"] = initial["m"][0]
-    return replace(problem, initial=initial, final_time=FreeTime(left), known_cost=None)
+    return problem.with_boundary(initial=initial, final_time=FreeTime(left), known_cost=None)

@@ -12,7 +12,7 @@ from helpers import relative
 from test_expansion import solver
 
 from ponn_torch.ansatz.basis import GaussianRBF
-from ponn_torch.guidance.accuracy import ORACLES, Allowed, certify, oracle_of
+from ponn_torch.guidance.accuracy import ORACLES, Allowed, GuidanceCertificate, certify, oracle_of
 from ponn_torch.guidance.closed_loop import Flight, fly
 from ponn_torch.guidance.controllers import HorizonController, Timetable, gain_schedule, timetable
 from ponn_torch.guidance.methods import Pseudospectral, RandomGaussians, TunedGaussians, first_horizon
@@ -68,6 +68,26 @@ def test_certificate_tells_a_true_error_from_a_loss() -> None:
     assert unfinished.verdict == "not certified: the flight was interrupted"
     late = certify(replace(flight, late=torch.ones(20, dtype=torch.bool)), planner, table)
     assert late.verdict == "not certified: no decision was checked"
+
+
+def test_what_nodes_leave_is_told_from_what_passes_leave() -> None:
+    problem = quadrotor()
+    table = Timetable(timetable(problem, "stop").starts[:4], [problem.horizon] * 4)
+
+    def found(passes: Passes, allowed: Allowed) -> GuidanceCertificate:
+        planner = Planner(problem, solver(), passes)
+        flight = fly(problem, HorizonController(planner, table), table, problem.initial)
+        return certify(flight, planner, table, n_samples=2, allowed=allowed)
+
+    newton = found(Passes(10, 1e-6, second_order=True, warm_start=True), Allowed(oracle=2e-3, iteration=1e-10))
+    assert newton.certified, newton.verdict
+    assert newton.largest_error > 1e5 * newton.largest_iteration_error  # ten nodes, and Newton's method to the end
+    few = found(Passes(4), Allowed(oracle=1.0, iteration=1e-5))
+    assert few.verdict.startswith("not certified: a control is ")
+    assert few.verdict.endswith("off the limit of its passes; allowed: 1e-05")
+    assert 1e-4 < few.largest_iteration_error < 0.1
+    with pytest.raises(ValueError, match=r"iteration_error = 0.0; allowed: above 0"):
+        Allowed(iteration=0.0)
 
 
 # -- methods -----------------------------------------------------------------------------------------
