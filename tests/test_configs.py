@@ -49,15 +49,6 @@ def test_the_glob_sees_every_group() -> None:
     assert {"problem", "ansatz", "nodes", "optimizer", "continuation", "record", "experiment"} <= groups
 
 
-@pytest.mark.parametrize(("group", "option"), OPTIONS)
-def test_config_builds_and_opens_with_what_it_is(group: str, option: str) -> None:
-    built(*overrides_of(group, option))
-    lines = (CONFIGS / group / f"{option}.yaml").read_text(encoding="utf-8").splitlines()
-    text = next(line for line in lines if not line.startswith("# @package"))
-    assert text.startswith("# ")
-    assert len(text) < 120
-
-
 def test_defaults_are_those_of_the_solver() -> None:
     solver, default = built().solver, Solver()
     for item in fields(Solver):
@@ -83,13 +74,15 @@ def calls(node: object) -> list[dict[str, object]]:
 WITHOUT_CONFIG = {"dtype", "device", "form", "basis", "smallest_damping", "largest_damping"}
 
 
-@pytest.mark.parametrize(
-    ("group", "option"), [pair for pair in OPTIONS if pair[0] not in ("experiment", "continuation")]
-)
-def test_config_holds_every_setting_of_what_it_calls(group: str, option: str) -> None:
-    config = OmegaConf.to_container(composed(overrides_of(group, option)))
-    assert isinstance(config, dict)
-    for node in calls(config[group]) if config.get(group) else []:
+@pytest.mark.parametrize(("group", "option"), OPTIONS)
+def test_config_builds_opens_with_what_it_is_and_holds_every_setting(group: str, option: str) -> None:
+    config = composed(overrides_of(group, option))
+    build(config)
+    lines = (CONFIGS / group / f"{option}.yaml").read_text(encoding="utf-8").splitlines()
+    text = next(line for line in lines if not line.startswith("# @package"))
+    assert text.startswith("# ")
+    assert len(text) < 120
+    for node in calls(OmegaConf.to_container(config).get(group)) if group != "continuation" else []:
         parameters = inspect.signature(target(node["_target_"], "_target_", ROOMS)).parameters
         assert set(parameters) - set(node) <= WITHOUT_CONFIG
 

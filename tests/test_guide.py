@@ -12,7 +12,6 @@ from test_configs import CONFIGS, calls
 
 from ponn_torch.cli import guide
 from ponn_torch.cli.flight import KINDS, build, run
-from ponn_torch.cli.landing import Descent
 from ponn_torch.cli.mission import Mission
 from ponn_torch.cli.overrides import RHC, groups, read
 from ponn_torch.cli.tracking import Tracking
@@ -54,8 +53,7 @@ def chosen_by(group: str, option: str) -> list[str]:
 
 def tiny(group: str, option: str) -> list[str]:
     """A flight of a few cycles."""
-    made = built(*chosen_by(group, option))
-    if isinstance(made, Descent):
+    if composed(*chosen_by(group, option)).kind == "landing":
         few = ["replanning.cycle=5", "replanning.step=0.25", "problem.planned_share=1", "n_samples=1"]
         return [*chosen_by(group, option), *few, "record=minimal"]
     chosen = ["problem=clohessy_wiltshire", "n_samples=2", "record=minimal"]
