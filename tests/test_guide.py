@@ -206,6 +206,7 @@ def test_an_error_inside_leaves_its_reason(tmp_path: Path, monkeypatch: pytest.M
         ("loop.noise=[1.0]", "loop.noise = [1.0]; allowed: one per state, r1"),
         ("loop.deadline=-1", "loop.deadline = -1.0; allowed: above 0 s"),
         ("n_vehicles=-1", "n_vehicles = -1; allowed: an integer from 0"),
+        ("flight=landing", "flight = 'landing' with problem = 'clohessy_wiltshire'; allowed: tracking"),
         ("kind=flying", "kind = 'flying'; allowed: tracking, landing"),
         (
             "replanning=default",

@@ -11,20 +11,26 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 
 from ponn_torch.build import resolved
 from ponn_torch.cli.job import DONE, Outcome, run_job
 from ponn_torch.cli.landing import Descent
-from ponn_torch.cli.mission import Mission
+from ponn_torch.cli.mission import PLANTS, Mission
 from ponn_torch.cli.overrides import RHC
 from ponn_torch.cli.session import Tool, sweep_member
 from ponn_torch.cli.tracking import Tracking
+from ponn_torch.guidance.descent import PoweredDescent
+from ponn_torch.guidance.tracking import TrackingProblem
 from ponn_torch.optimal_control.problem import nearest
 from ponn_torch.reporting.flights import FlightRecorder
-from ponn_torch.settings import ConfigError
+from ponn_torch.settings import ConfigError, target, types_of
 
-KINDS: dict[str, Callable[[Mapping[str, Any]], Mission]] = {"tracking": Tracking.build, "landing": Descent.build}
+Build = Callable[[Mapping[str, Any]], Mission]
+KINDS: dict[str, tuple[type, Build]] = {  # what is flown, and how a mission is made of settings
+    "tracking": (TrackingProblem, Tracking.build),
+    "landing": (PoweredDescent, Descent.build),
+}
 
 
 def build(config: DictConfig) -> Mission:
@@ -33,11 +39,18 @@ def build(config: DictConfig) -> Mission:
     Raises:
         ConfigError: a misspelt, missing or impossible setting.
     """
-    settings = resolved(config)
-    kind = settings.get("kind")
+    kind = OmegaConf.select(config, "kind")
     if kind not in KINDS:
         raise ConfigError(f"kind = {kind!r}; {nearest(str(kind), KINDS)}")
-    return KINDS[kind](settings)
+    wanted, make = KINDS[kind]
+    # before anything refers to settings that only the right kind of problem has
+    made = types_of(target(OmegaConf.select(config, "problem._target_"), "problem._target_", PLANTS)).get("return")
+    if made is not wanted:
+        allowed = ", ".join(name for name, (other, _) in KINDS.items() if made is other)
+        raise ConfigError(
+            f"flight = {kind!r} with problem = {OmegaConf.select(config, 'problem.name')!r}; allowed: {allowed}"
+        )
+    return make(resolved(config))
 
 
 def run(
