@@ -51,6 +51,7 @@ class Method:
     optimizer: Optimizer
     conditioning: str = "columns"
     seeded: bool = True
+    n_nodes: int | None = None  # where not those of the part
 
     def seeds(self, seeds: range) -> range:
         """One run of what no seed changes."""
@@ -59,6 +60,13 @@ class Method:
 
 HIDDEN = (20, 40)
 CHEBYSHEV = Method("Chebyshev, L = 60", lambda seed: Chebyshev(60), LINEAR, seeded=False)
+MANY_CHEBYSHEV = replace(CHEBYSHEV, name="Chebyshev, L = 186", free_function=lambda seed: Chebyshev(186), n_nodes=240)
 ELM = Method("ELM tanh, L = 60", lambda seed: RandomFeatures(60, "tanh", seed=seed), LINEAR)
 MLP_LM = Method("MLP 20-40, LM → output layer", lambda seed: MLP(HIDDEN, seed=seed), LM_OUTPUT)
-FROZEN = Method("the same, hidden layers untrained", lambda seed: FrozenMLP(HIDDEN, seed=seed), LINEAR)
+FROZEN = Method("MLP 20-40, hidden layers untrained", lambda seed: FrozenMLP(HIDDEN, seed=seed), LINEAR)
+MANY_ELM = replace(
+    ELM, name="ELM tanh, L = 186", free_function=lambda s: RandomFeatures(186, "tanh", seed=s), n_nodes=240
+)
+FEW = (10, 20)  # the unknowns of an ELM of 60 units
+FEW_LM = replace(MLP_LM, name="MLP 10-20, LM → output layer", free_function=lambda seed: MLP(FEW, seed=seed))
+FEW_FROZEN = replace(FROZEN, name="MLP 10-20, hidden layers untrained", free_function=lambda s: FrozenMLP(FEW, seed=s))

@@ -14,6 +14,7 @@ PARTS = {
     "networks": transfer.run_others,
     "layers": layers.run,
     "landing": landing.run,
+    "landing_networks": landing.run_networks,
     "arcs": arcs.run,
 }
 

@@ -24,7 +24,7 @@ def run(
     bvp: BoundaryValueProblem, method: Method, seed: int, n_nodes: int, guess: ScaledCurve, truth: ScaledCurve
 ) -> dict[str, Any]:
     """A row; errors are relative, in the root mean square over even times, of scaled states and costates."""
-    nodes = make_nodes("legendre_gauss", n_nodes, dtype=bvp.unit.dtype)
+    nodes = make_nodes("legendre_gauss", method.n_nodes or n_nodes, dtype=bvp.unit.dtype)
     disc = Discretisation(bvp, method.free_function(seed), nodes, conditioning=method.conditioning)
     residual = Collocation.on_segments(disc, bvp.unit.new_tensor([0.0, bvp.final_time]))
     result = method.optimizer.run(residual, project(residual, guess))
@@ -59,7 +59,7 @@ def lines(rows: list[Row], extra: Callable[[list[Row]], dict[str, str]] | None =
         out.append(
             {
                 "method": name,
-                "unknowns": mine[0]["unknowns"],
+                "unknowns": spread((row["unknowns"] for row in mine), ".0f"),
                 **(extra(mine) if extra else {}),
                 "error of states": spread(row["state_error"] for row in mine),
                 "error of costates": spread(row["costate_error"] for row in mine),

@@ -5,7 +5,20 @@ from __future__ import annotations
 import torch
 
 from experiments.elm_vs_deep import single
-from experiments.elm_vs_deep.methods import CHEBYSHEV, ELM, FIRST_ORDER, FROZEN, HIDDEN, LM_OUTPUT, MLP_LM, Method
+from experiments.elm_vs_deep.methods import (
+    CHEBYSHEV,
+    ELM,
+    FEW_FROZEN,
+    FEW_LM,
+    FIRST_ORDER,
+    FROZEN,
+    HIDDEN,
+    LM_OUTPUT,
+    MANY_CHEBYSHEV,
+    MANY_ELM,
+    MLP_LM,
+    Method,
+)
 from experiments.tables import Report, Row, markdown, share, worst
 from ponn_torch.ansatz.basis import Legendre
 from ponn_torch.ansatz.networks import MLP
@@ -29,7 +42,8 @@ TRAINED = [
     Method(f"MLP 20-40, {name}", lambda seed: MLP(HIDDEN, seed=seed), optimizer)
     for name, optimizer in FIRST_ORDER.items()
 ]
-METHODS = [CHEBYSHEV, ELM, FROZEN, MLP_LM]
+# first at the sizes one would take, then with as many unknowns as the network, or a network with as many as the ELM
+METHODS = [CHEBYSHEV, ELM, FROZEN, MLP_LM, MANY_CHEBYSHEV, MANY_ELM, FEW_FROZEN, FEW_LM]
 
 
 def truth(bvp: BoundaryValueProblem, guess: ScaledCurve) -> Curve:
