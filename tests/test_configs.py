@@ -144,6 +144,7 @@ INSTEAD = {
     **NEEDED,
     "adam_lbfgs": [f"optimizer.parts.{i}.stopping.max_iterations=2" for i in (0, 1)],
     "adam_lm": [f"optimizer.parts.{i}.stopping.max_iterations=2" for i in (0, 1)],
+    "variable_projection": ["ansatz=mlp", "ansatz.hidden=[6,6]", "optimizer.optimizer.stopping.max_iterations=2"],
     "lm_output": [
         "optimizer.parts.0.stopping.max_iterations=2",
         "optimizer.parts.1.optimizer.stopping.max_iterations=2",
@@ -151,9 +152,9 @@ INSTEAD = {
 }
 # Settings of a tiny budget that an option does not have.
 ABSENT = (
-    {"none": "refinement.max_rounds"}
-    | dict.fromkeys(("rbf", *MLPS), "ansatz.size")
-    | dict.fromkeys(("adam_lbfgs", "adam_lm", "lm_output"), "optimizer.stopping.max_iterations")
+    {"none": ["refinement.max_rounds"], "variable_projection": ["optimizer.stopping.max_iterations", "ansatz.size"]}
+    | {name: ["ansatz.size"] for name in ("rbf", *MLPS)}
+    | {name: ["optimizer.stopping.max_iterations"] for name in ("adam_lbfgs", "adam_lm", "lm_output")}
 )
 
 
@@ -176,7 +177,8 @@ def tiny(group: str, option: str) -> list[str]:
         chosen.pop("ansatz.size")
     for text in [f"{group}={option}", *INSTEAD.get(group, []), *INSTEAD.get(option, [])]:
         chosen[text.split("=")[0]] = text
-    chosen.pop(ABSENT.get(option, ""), None)
+    for key in ABSENT.get(option, []):
+        chosen.pop(key, None)
     return list(chosen.values())
 
 

@@ -7,9 +7,11 @@ from dataclasses import replace
 from torch import Tensor
 
 from experiments.elm_vs_deep import single
+from experiments.elm_vs_deep.growth import ALL_WEIGHTS, PROJECTED, Growth
 from experiments.elm_vs_deep.methods import CHEBYSHEV, ELM, FROZEN, MLP_LM, Method
 from experiments.tables import Report, Row, markdown, worst
-from ponn_torch.ansatz.basis import Chebyshev
+from ponn_torch.ansatz.basis import Chebyshev, RandomFeatures
+from ponn_torch.ansatz.networks import MLP
 from ponn_torch.optimal_control.pontryagin import BoundaryValueProblem, pontryagin
 from ponn_torch.problems.boundary_layer import boundary_layer, exact_solution
 from ponn_torch.solving.guess import ScaledCurve
@@ -27,6 +29,69 @@ def exact(bvp: BoundaryValueProblem, epsilon: float) -> ScaledCurve:
         return bvp.to_scaled(w[:, :2], w[:, 2:])
 
     return curve
+
+
+# -- few unknowns ------------------------------------------------------------------------------------------------------
+
+SIZES = (
+    10,
+    20,
+)  # hidden units; a network has six unknowns for each of them, a linear function four for each of its own
+GROWTHS = {
+    "units drawn, hidden layer untrained": Growth(None, 1),
+    "units chosen, hidden layer untrained": Growth(None),
+    "units chosen, LM on all weights": Growth(ALL_WEIGHTS),
+    "units chosen, variable projection": Growth(PROJECTED),
+}
+
+
+def _like(n_units: int) -> list[Method]:
+    """Linear functions with as many unknowns as a network of so many units, and that network from the seed's slopes."""
+    size = 3 * n_units // 2
+    return [
+        replace(CHEBYSHEV, name=f"Chebyshev, L = {size}", free_function=lambda seed: Chebyshev(size)),
+        replace(ELM, name=f"ELM tanh, L = {size}", free_function=lambda seed: RandomFeatures(size, "tanh", seed=seed)),
+        replace(MLP_LM, name="LM → output layer", free_function=lambda seed: MLP((n_units,), seed=seed)),
+    ]
+
+
+def run_few(seeds: range) -> Report:
+    rows: list[Row] = []
+    parts = []
+    for epsilon in EPSILONS:
+        bvp = pontryagin(boundary_layer(epsilon=epsilon))
+        truth = exact(bvp, epsilon)
+        for n_units in SIZES:
+            mine: list[Row] = []
+            for method in _like(n_units):
+                for seed in method.seeds(seeds):
+                    mine.append(single.run(bvp, method, seed, N_NODES, single.zero(bvp), truth))
+            for name, growth in GROWTHS.items():
+                for seed in seeds:
+                    mine.append(single.measured(name, seed, *growth.run(bvp, n_units, seed), truth))
+                    print(f"few {epsilon} {n_units} {name} {seed}: {mine[-1]['state_error']:.1e}", flush=True)
+            rows += [{"epsilon": epsilon, "units": n_units, **row} for row in mine]
+            parts.append(f"**ε = {epsilon:g}, {n_units} hidden units**\n\n{markdown(single.lines(mine))}")
+
+    def errors(name: str, epsilon: float, n_units: int) -> list[float]:
+        chosen = {"method": name, "epsilon": epsilon, "units": n_units}
+        return [row["state_error"] for row in rows if chosen.items() <= row.items()]
+
+    trained = list(GROWTHS)[-1]
+    measured = {}
+    for epsilon in EPSILONS:
+        for n_units in SIZES:
+            known = {row["method"] for row in rows if row["units"] == n_units} - {trained}
+            largest = worst(errors(trained, epsilon, n_units))
+            at = f"at {epsilon:g}, {n_units} units"
+            measured[f"few/trained states {at}"] = largest
+            for name in known:
+                measured[f"few/{name} over trained {at}"] = min(errors(name, epsilon, n_units)) / largest
+    text = f"Seeds {seeds[0]}–{seeds[-1]}; median [min, max].\n\n" + "\n\n".join(parts)
+    return Report({"few": rows}, text, measured)
+
+
+# -- many ------------------------------------------------------------------------------------------------------------
 
 
 def run(seeds: range) -> Report:

@@ -13,6 +13,7 @@ PARTS = {
     "transfer": transfer.run,
     "networks": transfer.run_others,
     "layers": layers.run,
+    "few": layers.run_few,
     "landing": landing.run,
     "landing_networks": landing.run_networks,
     "arcs": arcs.run,

@@ -11,6 +11,7 @@ from torch import Tensor
 from experiments.elm_vs_deep.methods import Method
 from experiments.tables import Row, spread
 from ponn_torch.numerics.nodes import make_nodes
+from ponn_torch.optim.base import OptimizeResult
 from ponn_torch.optimal_control.collocation import Collocation
 from ponn_torch.optimal_control.curve import Curve
 from ponn_torch.optimal_control.discretisation import Discretisation
@@ -28,6 +29,12 @@ def run(
     disc = Discretisation(bvp, method.free_function(seed), nodes, conditioning=method.conditioning)
     residual = Collocation.on_segments(disc, bvp.unit.new_tensor([0.0, bvp.final_time]))
     result = method.optimizer.run(residual, project(residual, guess))
+    return measured(method.name, seed, residual, result, truth)
+
+
+def measured(name: str, seed: int, residual: Collocation, result: OptimizeResult, truth: ScaledCurve) -> dict[str, Any]:
+    """A result as a row."""
+    bvp = residual.bvp
     curve = Curve(residual, result.xi)
     t = torch.linspace(0.0, bvp.final_time, N_TEST, dtype=bvp.unit.dtype)
     found, expected, n = curve(t), truth(t), bvp.n_states
@@ -36,7 +43,7 @@ def run(
         return float((found[:, part] - expected[:, part]).norm() / expected[:, part].norm())
 
     return {
-        "method": method.name,
+        "method": name,
         "seed": seed,
         "unknowns": residual.n_unknowns,
         "status": result.status.name,
