@@ -55,12 +55,26 @@ class Growth:
     Attributes:
         train: Levenberg–Marquardt on all weights, or variable projection; None: units stay as they are drawn.
         n_candidates: of which the best is taken; 1: drawn, not chosen, and its centre from an even density.
+        n_starts: networks grown, of which that of the smallest residual is kept.
     """
 
     train: Optimizer | None = PROJECTED
     n_candidates: int = 200
+    n_starts: int = 1
 
     def run(self, bvp: BoundaryValueProblem, n_units: int, seed: int) -> tuple[Collocation, OptimizeResult]:
+        """The residual and the best point; iterations, counts and CPU seconds are those of all starts."""
+        grown = [self._grown(bvp, n_units, seed + 1000 * start) for start in range(self.n_starts)]
+        residual, best = min(grown, key=lambda pair: float(pair[1].norm))
+        results = [result for _, result in grown]
+        return residual, replace(
+            best,
+            n_residuals=sum(result.n_residuals for result in results),
+            records=[entry for result in results for entry in result.records],
+            cpu_seconds=sum(result.cpu_seconds for result in results),
+        )
+
+    def _grown(self, bvp: BoundaryValueProblem, n_units: int, seed: int) -> tuple[Collocation, OptimizeResult]:
         generator, watch = torch.Generator().manual_seed(seed), Stopwatch()
         slopes = offsets = FINE.points[:0]
         density, results = FINE.weights, []

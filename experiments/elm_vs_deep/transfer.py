@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import torch
 
 from experiments.elm_vs_deep import single
@@ -13,6 +15,7 @@ from experiments.elm_vs_deep.methods import (
     FIRST_ORDER,
     FROZEN,
     HIDDEN,
+    LINEAR,
     LM_OUTPUT,
     MANY_CHEBYSHEV,
     MANY_ELM,
@@ -24,6 +27,7 @@ from ponn_torch.ansatz.basis import Legendre
 from ponn_torch.ansatz.networks import MLP
 from ponn_torch.numerics.nodes import make_nodes
 from ponn_torch.optim.base import Stopping
+from ponn_torch.optim.chain import OutputLayer
 from ponn_torch.optim.least_squares import LevenbergMarquardt
 from ponn_torch.optimal_control.collocation import Collocation
 from ponn_torch.optimal_control.curve import Curve
@@ -33,10 +37,15 @@ from ponn_torch.problems.energy_transfer import energy_transfer
 from ponn_torch.solving.guess import ScaledCurve, project
 from ponn_torch.solving.paths import PolarTransfer
 
+_NETWORKS: dict[str, Callable[[int], MLP]] = {
+    "MLP 20-40 of sines": lambda seed: MLP(HIDDEN, "sin", seed=seed),
+    "residual MLP 32-32": lambda seed: MLP((32, 32), residual=True, seed=seed),
+    "an MLP 8-16 per unknown": lambda seed: MLP((8, 16), shared=False, seed=seed),
+}
 OTHERS = [
-    Method("MLP 20-40 of sines, LM → output layer", lambda seed: MLP(HIDDEN, "sin", seed=seed), LM_OUTPUT),
-    Method("residual MLP 32-32, LM → output layer", lambda s: MLP((32, 32), residual=True, seed=s), LM_OUTPUT),
-    Method("an MLP 8-16 per unknown, LM → output layer", lambda s: MLP((8, 16), shared=False, seed=s), LM_OUTPUT),
+    Method(f"{name}, {how}", network, optimizer)
+    for name, network in _NETWORKS.items()
+    for how, optimizer in (("LM → output layer", LM_OUTPUT), ("hidden layers untrained", OutputLayer(LINEAR)))
 ]
 TRAINED = [
     Method(f"MLP 20-40, {name}", lambda seed: MLP(HIDDEN, seed=seed), optimizer)
