@@ -13,7 +13,7 @@ from ponn_torch.guidance.expansion import Expansion, expand, table
 from ponn_torch.guidance.horizon import HorizonSolution, HorizonSolver, LinearTPBVP
 from ponn_torch.guidance.tracking import TrackingProblem
 from ponn_torch.numerics.nodes import interpolation_matrix
-from ponn_torch.numerics.tracing import trace
+from ponn_torch.numerics.tape import taped
 
 
 @dataclass(frozen=True)
@@ -100,7 +100,7 @@ class Planner:
             return expand(self.problem, *arguments)
         key = (x.shape, second)
         if key not in self._tables:
-            self._tables[key] = trace(partial(table, self.problem), *arguments)
+            self._tables[key] = taped(partial(table, self.problem), *arguments)
         return Expansion(self._tables[key](*arguments))
 
     @cached_property

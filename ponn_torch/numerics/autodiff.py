@@ -15,13 +15,14 @@ from torch import Tensor
 from torch.func import grad, vjp, vmap
 
 
-def _inside_transform() -> bool:
+def inside_transform() -> bool:
+    """Whether a transform of torch.func is at work."""
     return torch._C._functorch.peek_interpreter_stack() is not None
 
 
 def differentiable(*inputs: Tensor | None) -> AbstractContextManager[Any]:
     """Build graphs inside only if one of the inputs asks for it; what is computed from constants stays constant."""
-    if _inside_transform():
+    if inside_transform():
         return nullcontext()
     asked = any(x is not None and x.requires_grad for x in inputs)
     return torch.set_grad_enabled(torch.is_grad_enabled() and asked)
@@ -39,7 +40,7 @@ def gradients_and_values(
     function: Callable[..., tuple[Tensor, tuple[Tensor, ...]]], *arguments: Tensor
 ) -> tuple[tuple[Tensor, ...], tuple[Tensor, ...]]:
     """As ``gradients``, for a function that returns other tensors besides: (gradients, those)."""
-    if _inside_transform():
+    if inside_transform():
 
         def total(*x: Tensor) -> tuple[Tensor, tuple[Tensor, ...]]:
             value, others = function(*x)
@@ -68,7 +69,7 @@ def pointwise_jacobian(
     single backward pass gives all rows.
     """
     n, count = len(arguments[0]), len(rows)
-    if _inside_transform():
+    if inside_transform():
         value, pull, *_ = vjp(lambda *x: function(*x, *constants), *arguments)
         seeds = torch.eye(value.shape[-1], dtype=value.dtype, device=value.device)[list(rows)]
         pulled = vmap(lambda seed: pull(seed.expand_as(value)))(seeds)

@@ -10,7 +10,7 @@ multipliers of a terminal manifold.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -18,7 +18,8 @@ import torch
 from torch import Tensor
 
 from ponn_torch.numerics.autodiff import row_gradients
-from ponn_torch.numerics.linalg import ArrowJacobian
+from ponn_torch.numerics.linalg import ArrowJacobian, DenseJacobian, Jacobian
+from ponn_torch.numerics.tape import recordable
 from ponn_torch.optimal_control.control_laws import Regime
 from ponn_torch.optimal_control.discretisation import Discretisation
 from ponn_torch.optimal_control.linearisation import linearise
@@ -265,21 +266,29 @@ class Collocation:
             if not group.trivial:
                 scale = h[..., None] ** group.order * group.factors[:, -1]
                 pointwise = pointwise - scale[..., None] * rates[..., group.columns[:, -1]].mT
-            pointwise = pointwise / self.stretch(h)[..., None, None] ** (group.order - 1)
-            rows.append((pointwise @ group.test.mT).flatten(-2))
+            if group.order > 1 and len(self.free_times):
+                pointwise = pointwise / self.stretch(h)[..., None, None] ** (group.order - 1)
+            tested = pointwise @ group.test.mT if group.pointwise is None else pointwise * group.pointwise
+            rows.append(tested.flatten(-2))
         return torch.cat(rows, -1)
 
     # -- the protocol of the optimisers --------------------------------------------------------------------------------
 
     def residual(self, xi: Tensor) -> Tensor:
         """r (..., R): the segments' equations, then switching rows S(t_k) = 0, then terminal rows."""
+        return self._replayed("residual", lambda: (self._residual(xi),), xi)[0]
+
+    def _residual(self, xi: Tensor) -> Tensor:
         unknowns = self.unpack(xi)
         h = (unknowns.times[..., 1:] - unknowns.times[..., :-1]) / 2
         jets, _, _ = self.jets(unknowns, h)
         t, w = self.points(jets, unknowns.times, h)
         rates = self.bvp.rates(t.reshape(-1, 1), w.reshape(-1, w.shape[-1]), self.point_setting(t.shape[:-1]))
         equations = self.equations(jets, h, rates.view(w.shape))
-        extra = self._extra_rows(unknowns.knots, unknowns.times, unknowns.multipliers)
+        return self.rows(equations, self._extra_rows(unknowns.knots, unknowns.times, unknowns.multipliers), h)
+
+    def rows(self, equations: Tensor, extra: Tensor, h: Tensor) -> Tensor:
+        """r (..., R) from the segments' equations (..., K, n_rows) and the extra rows (..., E)."""
         rows = torch.cat([equations.flatten(-2), extra], -1)
         # segments must keep their order: a step that turns one around is to be rejected
         return torch.where((h > 0).all(-1, keepdim=True), rows, torch.nan) if len(self.free_times) else rows
@@ -296,9 +305,43 @@ class Collocation:
         x = bvp.to_physical(unknowns.knots[..., -1, :])[0]
         return total + bvp.terminal_cost(unknowns.times[..., -1:], x, end)[..., 0]
 
-    def linearise(self, xi: Tensor) -> tuple[Tensor, ArrowJacobian]:
-        """(r, J), exact; see linearisation.py."""
-        return linearise(self, xi)
+    def linearise(self, xi: Tensor) -> tuple[Tensor, Jacobian]:
+        """(r, J), exact; see linearisation.py. One segment has nothing to be eliminated: its J is one matrix."""
+
+        def parts() -> tuple[Tensor, ...]:
+            residual, arrow = linearise(self, xi)
+            if self.n_segments == 1:
+                return residual, arrow.dense()
+            return residual, arrow.local, arrow.shared, arrow.extra
+
+        residual, *blocks = self._replayed("linearise", parts, xi)
+        if self.n_segments == 1:
+            return residual, DenseJacobian(*blocks)
+        local, shared, extra = blocks
+        return residual, ArrowJacobian(local, shared, extra, self.shared_index)
+
+    # -- playing it back ---------------------------------------------------------------------------------------------
+
+    @cached_property
+    def _varied(self) -> tuple[Tensor, ...]:
+        """All data but ξ: collocations that differ in nothing else share their tapes."""
+        regime = self.setting.regime
+        data = (self.known_knots, self.known_times, self._fractions, regime.smoothing, regime.arcs)
+        return tuple(x for x in (*data, *self.setting.parameters.values()) if x is not None)
+
+    @cached_property
+    def _structure(self) -> tuple[object, ...]:
+        """What a tape is good for."""
+        known = tuple(self.free_knots.tolist()), tuple(self.free_times.tolist()), self.events
+        regime = self.setting.regime.smoothing is None, self.setting.regime.arcs is None
+        return (*known, *regime, *self.setting.parameters, *(tuple(x.shape) for x in self._varied))
+
+    def _replayed(self, name: str, function: Callable[[], tuple[Tensor, ...]], xi: Tensor) -> tuple[Tensor, ...]:
+        """What the function of ξ and this collocation gives, from a tape where it has been asked for often."""
+        if not recordable(xi, *self.setting.parameters.values()):
+            return function()
+        replay = self.discretisation.replays[name, *self._structure, tuple(xi.shape)]
+        return replay(function, xi, *self._varied)
 
     @cached_property
     def shared_index(self) -> Tensor:
@@ -318,7 +361,7 @@ class Collocation:
         """Anchors (K,) before and after every segment."""
         return self._anchors[0, :-1], self._anchors[1, 1:]
 
-    @cached_property
+    @property
     def end_fractions(self) -> tuple[Tensor, Tensor]:
         """How far the two ends of every segment (K,) lie between its anchors."""
         fractions = self._fractions

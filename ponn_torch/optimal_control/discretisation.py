@@ -6,9 +6,10 @@ value problem, whatever its segments.
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import torch
 from torch import Tensor
@@ -17,6 +18,7 @@ from ponn_torch.ansatz.basis import FreeFunction, LinearBasis
 from ponn_torch.ansatz.constraints import SwitchingFunctions, hermite
 from ponn_torch.ansatz.networks import MLP
 from ponn_torch.numerics.nodes import NodeSet, legendre_moments
+from ponn_torch.numerics.tape import Replay
 from ponn_torch.optimal_control.deep_expressions import DeepExpressions
 from ponn_torch.optimal_control.expressions import Expressions, LinearExpressions
 from ponn_torch.optimal_control.pontryagin import BoundaryValueProblem, Chain
@@ -79,6 +81,13 @@ class Group:
         return self.columns.shape[0]
 
 
+@lru_cache(maxsize=64)
+def _hermite(order: int, nodes: NodeSet) -> tuple[SwitchingFunctions, Tensor]:
+    """The switching functions of a chain's constraints, and Ω (q+1, n, 2q) at the nodes."""
+    switching = SwitchingFunctions(hermite(order), dtype=nodes.points.dtype, device=nodes.points.device)
+    return switching, switching(nodes.points, order)[:, :, 0]
+
+
 @dataclass(frozen=True, eq=False)
 class Discretisation:
     """Basis, nodes and form, tabulated for the chains of a boundary value problem; shared by all its residuals.
@@ -105,7 +114,7 @@ class Discretisation:
 
     def _group(self, order: int, trivial: bool, chains: Sequence[Chain], before: Group | None) -> Group:
         nodes, like = self.nodes, self.nodes.points
-        switching = SwitchingFunctions(hermite(order), dtype=like.dtype, device=like.device)
+        switching, Omega = _hermite(order, nodes)
         # a trivial chain is the Hermite interpolant, of degree 2q−1: y^(q) = 0 has q coefficients to be met
         test = legendre_moments(nodes, order) if trivial else self.form.matrix(nodes)
         used = 0 if trivial else len(chains)
@@ -116,7 +125,7 @@ class Discretisation:
             columns=torch.tensor([c.columns for c in chains], device=like.device),
             factors=torch.tensor([c.factors for c in chains], dtype=like.dtype, device=like.device),
             switching=switching,
-            Omega=switching(like, order)[:, :, 0],
+            Omega=Omega,
             test=test,
             rows=slice(rows, rows + len(chains) * test.shape[0]),
             active=slice(active, active + used),
@@ -135,6 +144,11 @@ class Discretisation:
         if isinstance(self.basis, MLP):
             return DeepExpressions(self, self.basis)
         raise TypeError(f"basis = {type(self.basis).__name__}; allowed: a LinearBasis or an MLP")
+
+    @cached_property
+    def replays(self) -> defaultdict[tuple[object, ...], Replay]:
+        """Tapes of what residuals on this discretisation compute, by their structure."""
+        return defaultdict(Replay)
 
     @property
     def n_own(self) -> int:

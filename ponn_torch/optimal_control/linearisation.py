@@ -41,7 +41,7 @@ def linearise(collocation: Collocation, xi: Tensor) -> tuple[Tensor, ArrowJacobi
     equations = collocation.equations(jets, h, rates)
     _weigh(collocation, equations, h, local, shared)
     extra_rows, extra = collocation.extra_linearised(unknowns)
-    residual = torch.cat([equations.flatten(-2), extra_rows], -1)
+    residual = collocation.rows(equations, extra_rows, h)
     return residual, ArrowJacobian(local, shared, extra, collocation.shared_index)
 
 

@@ -18,6 +18,7 @@ from torch import Tensor
 from ponn_torch.numerics.linalg import ArrowJacobian
 from ponn_torch.optimal_control.collocation import Collocation, component_names
 from ponn_torch.optimal_control.curve import Curve
+from ponn_torch.optimal_control.linearisation import linearise
 from ponn_torch.optimal_control.problem import DisplayUnit, OptimalControlProblem, nearest
 
 
@@ -206,7 +207,7 @@ class Measured:
     def linearise(self, xi: Tensor) -> tuple[Tensor, ArrowJacobian]:
         """(r, J); rows of measurements by reverse mode through the expression at their times."""
         rows, width = self._place(xi)
-        r, jacobian = self.collocation.linearise(xi)
+        r, jacobian = linearise(self.collocation, xi)
         point = xi.detach().requires_grad_()
         with torch.enable_grad():
             deviations = self._deviations(point, rows)

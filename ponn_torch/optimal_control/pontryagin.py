@@ -83,16 +83,17 @@ class BoundaryValueProblem:
         """Scaled final time, or its guess."""
         return self.problem.time_guess / self.time_unit
 
+    @cached_property
+    def _curved(self) -> Tensor:
+        return self.exponent != 0
+
     def _psi(self, y: Tensor) -> tuple[Tensor, Tensor]:
         """ψ(y) and ψ'(y)."""
         if self.mass_variable == "mass":
             return self.unit * y, self.unit.expand_as(y)
-        curved = self.exponent != 0
-        exponential = self.unit * torch.exp(torch.where(curved, self.exponent * y, torch.zeros_like(y)))
-        return (
-            torch.where(curved, exponential, self.unit * y),
-            torch.where(curved, self.exponent * exponential, self.unit.expand_as(y)),
-        )
+        curved, exponential = self._curved, torch.exp(self.exponent * y)  # 1 where the exponent is 0
+        scale = self.unit * torch.where(curved, exponential, 1.0)
+        return torch.where(curved, scale, self.unit * y), torch.where(curved, self.exponent * scale, scale)
 
     def to_physical(self, w: Tensor) -> tuple[Tensor, Tensor]:
         """States and costates in the user's units from w (..., 2n)."""

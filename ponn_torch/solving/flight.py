@@ -14,7 +14,7 @@ from torch import Tensor
 
 from ponn_torch.numerics.autodiff import gradients
 from ponn_torch.numerics.piecewise import PiecewiseChebyshev, approximate
-from ponn_torch.numerics.tracing import trace
+from ponn_torch.numerics.tape import taped
 from ponn_torch.optimal_control.control_laws import Regime
 from ponn_torch.optimal_control.pontryagin import Setting
 from ponn_torch.optimal_control.problem import Named
@@ -182,11 +182,11 @@ def fly_extremal(solution: Solution, history: list[PiecewiseChebyshev], *, expli
     start = solution.curve.knots[0].detach().double().cpu()
     y0 = torch.cat([start, start.new_zeros(1 + int(explicit_time))])
     t0 = y0.new_full((1,), 0.37 * float(solution.curve.times[-1]))
-    graph = trace(right_hand_side, t0, y0, codes[0])
+    flown = taped(right_hand_side, t0, y0, codes[0])
 
     def rates(t: float, y: Array, arc: int) -> Array:
         with torch.no_grad():  # a function that cannot be traced takes its slopes by autograd
-            return graph(t0.new_tensor([t]), torch.from_numpy(y), codes[arc]).numpy()
+            return flown(t0.new_tensor([t]), torch.from_numpy(y), codes[arc]).numpy()
 
     return fly(rates, arc_knots(solution), y0.numpy(), history, restarts=restarts(solution))
 
@@ -210,10 +210,10 @@ def fly_control(solution: Solution, history: list[PiecewiseChebyshev]) -> Flight
 
     y0 = torch.cat([x0 / bvp.unit, x0.new_zeros(1)])
     t0 = y0.new_full((1,), 0.37 * float(solution.curve.times[-1]))
-    graph = trace(right_hand_side, t0, y0, torch.from_numpy(history[0](float(t0))))
+    flown = taped(right_hand_side, t0, y0, torch.from_numpy(history[0](float(t0))))
 
     def rates(t: float, y: Array, arc: int) -> Array:
         with torch.inference_mode():
-            return graph(t0.new_tensor([t]), torch.from_numpy(y), torch.from_numpy(history[arc](t))).numpy()
+            return flown(t0.new_tensor([t]), torch.from_numpy(y), torch.from_numpy(history[arc](t))).numpy()
 
     return fly(rates, arc_knots(solution), y0.numpy(), history)

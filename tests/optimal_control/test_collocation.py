@@ -14,6 +14,7 @@ from torch.func import jacfwd
 
 from ponn_torch.ansatz.basis import Chebyshev
 from ponn_torch.numerics.nodes import differentiation_matrix, make_nodes
+from ponn_torch.numerics.tape import RECORDING_PAYS
 from ponn_torch.optim.base import Stopping
 from ponn_torch.optim.least_squares import LevenbergMarquardt
 from ponn_torch.optimal_control.collocation import Collocation, component_names
@@ -57,6 +58,61 @@ def jacobian_error(made: Collocation, xi: Tensor) -> float:
     assert jacobian.dense().shape == expected.shape
     size = expected.abs().amax(-1, keepdim=True).clamp_min(1e-3 * float(expected.abs().max()))
     return float(((jacobian.dense() - expected).abs() / size).max())
+
+
+# -- tapes -------------------------------------------------------------------------------------------------
+
+
+def as_it_is(made: Collocation, xi: Tensor) -> tuple[Tensor, Tensor]:
+    """(r, J) of a collocation that has recorded nothing."""
+    disc = made.discretisation
+    fresh = Discretisation(disc.bvp, disc.basis, disc.nodes, disc.form, disc.conditioning)
+    r, jacobian = replace(made, discretisation=fresh).linearise(xi)
+    return r, jacobian.dense()
+
+
+def check_tapes(made: Collocation, other: Collocation) -> None:
+    """Asked often enough, residuals and Jacobians come from tapes: the same bits, for other data as well."""
+    xi = unknowns(made)
+    for _ in range(RECORDING_PAYS + 1):
+        made.residual(xi)
+        made.linearise(xi)
+    assert all(replay.recorded for replay in made.discretisation.replays.values())
+    count = len(made.discretisation.replays)
+    for one, seed in ((made, 3), (other, 4)):
+        point = unknowns(one, seed=seed)
+        r, jacobian = one.linearise(point)
+        expected, matrix = as_it_is(one, point)
+        assert torch.equal(r, expected)
+        assert torch.equal(jacobian.dense(), matrix)
+        assert torch.equal(one.residual(point), replace(one, discretisation=made.discretisation)._residual(point))
+    assert len(made.discretisation.replays) == count  # the other one plays the same tapes
+
+
+@pytest.mark.parametrize("name", ["earth_mars", "mars_landing", "small_body_landing", "tfc_test_2", "energy_transfer"])
+def test_a_residual_that_is_asked_for_often_is_played_from_a_tape(name):
+    made = collocation(bvp_of(name), n_neurons=4, n_nodes=6, smoothing=0.4)
+    other = replace(made, known_knots=1.01 * made.known_knots, known_times=1.1 * made.known_times)
+    check_tapes(made, other.with_setting(smoothing=0.2) if made.setting.regime.smoothing is not None else other)
+
+
+def test_arcs_with_subdivisions_are_played_for_other_times_arcs_and_fractions():
+    bvp = bvp_of("tfc_test_1")
+    events = [None, 0, None]
+    made = on_times(bvp, [0.0, 0.2, 0.5, 0.7, 1.0], events, [[0], [0], [2], [2]])
+    other = on_times(bvp, [0.0, 0.3, 0.4, 0.5, 1.0], events, [[2], [2], [0], [0]])
+    check_tapes(made, replace(other, discretisation=made.discretisation))
+
+
+def test_what_is_differentiated_is_not_played():
+    made = collocation(bvp_of("mars_landing"), n_neurons=4, n_nodes=6, smoothing=0.4)
+    xi = unknowns(made)
+    for _ in range(RECORDING_PAYS + 1):
+        made.residual(xi)
+    point = xi.clone().requires_grad_()
+    (gradient,) = torch.autograd.grad(made.residual(point).square().sum(), point)
+    r, jacobian = made.linearise(xi)
+    assert relative(gradient, 2 * jacobian.gradient(r)) < 1e-11
 
 
 # -- Jacobian ------------------------------------------------------------------------------------------------
