@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 import torch
@@ -31,6 +32,7 @@ class NodeSet:
     def __len__(self) -> int:
         return self.points.shape[0]
 
+    @lru_cache(maxsize=64)  # noqa: B019  the rules themselves are kept for good as well
     def between(self, n_points: int) -> Tensor:
         """About n_points off the nodes, ascending: even in every panel, as many as its share of the nodes asks for."""
         edges = self.points.new_tensor([-1.0, 1.0]) if self.edges is None else self.edges
@@ -119,6 +121,7 @@ _RULES: dict[str, tuple[Callable[[int], tuple[Array, Array]], int]] = {  # rule,
 NODE_KINDS = tuple(_RULES)
 
 
+@lru_cache(maxsize=128)
 def make_nodes(
     kind: str, n_nodes: int, *, dtype: torch.dtype = torch.float64, device: torch.device | str = "cpu"
 ) -> NodeSet:

@@ -8,7 +8,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Protocol
+from functools import lru_cache
+from typing import TYPE_CHECKING, Any, Protocol
 
 import torch
 from torch import Tensor
@@ -16,6 +17,7 @@ from torch import Tensor
 from ponn_torch.ansatz.basis import LinearBasis
 from ponn_torch.ansatz.constraints import hermite
 from ponn_torch.ansatz.expression import ConstrainedExpression
+from ponn_torch.numerics.nodes import NodeSet
 
 if TYPE_CHECKING:
     from ponn_torch.optimal_control.discretisation import Discretisation, Group
@@ -73,6 +75,9 @@ class _Tables:
         return self.B.shape[-1]
 
 
+GRIDS = 4  # grids between the nodes whose tables are kept
+
+
 class LinearExpressions:
     """β of every chain; one product with a table gives all derivatives at all nodes."""
 
@@ -80,21 +85,18 @@ class LinearExpressions:
         self.groups, self.nodes = discretisation.groups, discretisation.nodes
         tables: list[_Tables] = []
         for group in self.groups:
-            expression = ConstrainedExpression(
-                basis.beyond(2 * group.order),
-                hermite(group.order),
-                nodes=self.nodes,
-                order=group.order,
-                conditioning=discretisation.conditioning,
-                combinations=discretisation.combinations.get(group.order),
-                dtype=self.nodes.points.dtype,
-                device=self.nodes.points.device,
-            )
-            B = _free(group, expression.tables(self.nodes.points, group.order)[0])
+            how = self.nodes, group.order, discretisation.conditioning
+            given = discretisation.combinations.get(group.order)
+            if given is None and not dict(basis.named_buffers()):
+                expression, B = _made_once(type(basis), tuple(basis.arguments.items()), *how)
+            else:
+                expression, B = _expression(basis, *how, given)
+            B = _free(group, B)
             both = torch.cat([B, group.Omega], -1).movedim(-1, 0).flatten(1)
             start = tables[-1].own.stop if tables else 0
             tables.append(_Tables(expression, B, both, slice(start, start + group.n_chains * B.shape[-1])))
         self.tables = tuple(tables)
+        self._kept: dict[tuple[int, int], tuple[Tensor, Tensor]] = {}
         self.output_layer = torch.arange(self.n_own, device=self.nodes.points.device)
 
     @property
@@ -120,9 +122,17 @@ class LinearExpressions:
     def jets_at(self, z: Tensor, weights: Tensor, kappas: Sequence[Tensor]) -> list[Tensor]:
         out = []
         for i, kappa in enumerate(kappas):
-            table, both = self._table_at(i, z), torch.cat([self.beta(i, weights), kappa], -1)
-            out.append(torch.einsum("omk,...dk->...dom", table, both))
+            both = torch.cat([self.beta(i, weights), kappa], -1)
+            out.append(torch.einsum("omk,...dk->...dom", self._table_once(i, z), both))
         return out
+
+    def _table_once(self, i: int, z: Tensor) -> Tensor:
+        """The table at z, kept for the next time that the same grid comes: residuals between the nodes are many."""
+        if (i, id(z)) not in self._kept:
+            if len(self._kept) >= GRIDS * len(self.groups):
+                self._kept.clear()
+            self._kept[i, id(z)] = z, self._table_at(i, z)  # that z is kept too makes its id its own
+        return self._kept[i, id(z)][1]
 
     def jets_along(self, z: Tensor, segment: Tensor, weights: Tensor, kappas: Sequence[Tensor]) -> list[Tensor]:
         out = []
@@ -165,6 +175,32 @@ class LinearExpressions:
                 )
                 self.beta(i, weights).copy_(fitted.mT)
         return weights
+
+
+def _expression(
+    basis: LinearBasis, nodes: NodeSet, order: int, conditioning: str, combinations: Tensor | None = None
+) -> tuple[ConstrainedExpression, Tensor]:
+    """Around the functions that a chain's Hermite constraints do not span; and B (q+1, n, L) at the nodes."""
+    points = nodes.points
+    expression = ConstrainedExpression(
+        basis.beyond(2 * order),
+        hermite(order),
+        nodes=nodes,
+        order=order,
+        conditioning=conditioning,
+        combinations=combinations,
+        dtype=points.dtype,
+        device=points.device,
+    )
+    return expression, expression.tables(points, order)[0]
+
+
+@lru_cache(maxsize=64)
+def _made_once(
+    kind: type[LinearBasis], arguments: tuple[tuple[str, Any], ...], nodes: NodeSet, order: int, conditioning: str
+) -> tuple[ConstrainedExpression, Tensor]:
+    """The same for all problems, where the basis draws nothing: its arguments say all."""
+    return _expression(kind(**dict(arguments)), nodes, order, conditioning)
 
 
 def _free(group: Group, table: Tensor) -> Tensor:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
 
@@ -138,7 +139,7 @@ class Solution:
         """Times in s at which an arc ends; fixed knots do not count."""
         return [float(self.curve.times[k]) * self.bvp.time_unit for k in self.curve.collocation.switch_knots]
 
-    @property
+    @cached_property
     def off_node_residual(self) -> float:
         """Largest |ẇ − F| between the nodes, scaled."""
         return self.curve.off_node_residual()
