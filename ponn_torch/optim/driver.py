@@ -103,6 +103,11 @@ class Counted:
         self.n_derivatives += 1
         return self._residual.linearise(xi)
 
+    def linearise_ahead(self, xi: Tensor) -> tuple[Tensor, Jacobian]:
+        """As ``linearise``, in place of the residual of a trial point."""
+        self.n_residuals += 1
+        return self.linearise(xi)
+
     def gradient(self, xi: Tensor, weights: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """r (..., R) and Jᵀ W² r (..., N), by reverse mode through the residual.
 

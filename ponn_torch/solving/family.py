@@ -24,7 +24,9 @@ from ponn_torch.solving.refinement import Segmentation
 
 
 def _warm() -> LevenbergMarquardt:
-    return LevenbergMarquardt(Stopping(tolerance=1e-9, decrease=1e-2, patience=2, max_iterations=12), damping=1e-8)
+    return LevenbergMarquardt(
+        Stopping(tolerance=1e-9, decrease=1e-2, patience=2, max_iterations=12), damping=1e-8, ahead=True
+    )
 
 
 @dataclass(frozen=True)

@@ -226,6 +226,21 @@ def test_small_step():
     assert all(float(r["step"]) >= 1e-4 for r in result.records[:-1] if r["accepted"])
 
 
+@pytest.mark.parametrize("name", ["rosenbrock", "exponential_fit"])
+def test_a_jacobian_formed_ahead_changes_no_step(name):
+    """Only the number of linearisations: one a trial, which is a residual as well."""
+    residual, start = start_of(name)
+    plain, ahead = (LevenbergMarquardt(Stopping(tolerance=1e-10), ahead=a).run(residual, start) for a in (False, True))
+    assert [r["norm"] for r in ahead.records] == [r["norm"] for r in plain.records]
+    assert torch.equal(ahead.xi, plain.xi)
+    assert all(r["accepted"] for r in plain.records) is (name == "exponential_fit")  # with rejected steps and without
+    assert ahead.n_linearisations == ahead.n_iterations + 1
+    assert ahead.n_residuals == plain.n_residuals
+    together = torch.stack([start, 1.01 * start])
+    batches = [LevenbergMarquardt(Stopping(tolerance=1e-10), ahead=a).run(residual, together) for a in (False, True)]
+    assert torch.equal(batches[0].xi, batches[1].xi)
+
+
 def test_iteration_limit():
     residual, start = start_of("rosenbrock")
     result = LevenbergMarquardt(Stopping(max_iterations=3)).run(residual, start)
