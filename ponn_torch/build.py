@@ -206,6 +206,7 @@ def _solver(node: dict[str, Any], top: Mapping[str, Any]) -> Solver:
         "n_segments",
         "mass_variable",
         "start_limit",
+        "warm_damping",
         "stage_tolerance",
         "trust",
         "tolerances",

@@ -131,6 +131,14 @@ def loosened(optimizer: Optimizer, tolerance: float) -> Optimizer:
     return cast(Optimizer, replace(made, stopping=replace(rule, tolerance=tolerance)))
 
 
+def warm(optimizer: Optimizer, damping: float) -> Optimizer:
+    """The optimiser with no larger first damping than this; one without damping comes back as it is."""
+    made: Any = optimizer
+    if not getattr(made, "damping", 0.0) > damping:
+        return optimizer
+    return cast(Optimizer, replace(made, damping=damping))
+
+
 class NonFiniteResidual(FloatingPointError):
     """The residual is not finite at a starting point; the message names equations."""
 

@@ -20,9 +20,15 @@ class Outcome(Enum):
 
     SOLVED = "solved"
     UNCHANGED = "solved, and the same as before: smaller values change nothing"
+    LEGIBLE = "solved, and sharp enough for what comes next"
     UNTRUSTED = "solved at the nodes, but not between them"
     FAILED = "not solved"
     ABORT = "give this start up"
+
+    @property
+    def final(self) -> bool:
+        """Nothing more is to be tried."""
+        return self in (Outcome.ABORT, Outcome.LEGIBLE)
 
 
 class Attempt(Protocol):
@@ -54,7 +60,7 @@ class Ladder:
     def run(self, attempt: Attempt) -> None:
         for value in self.values:
             outcome = attempt(float(value), self.parameter, self.form)
-            if outcome is Outcome.ABORT or (outcome is Outcome.UNCHANGED and self.stop_unchanged):
+            if outcome.final or (outcome is Outcome.UNCHANGED and self.stop_unchanged):
                 return
 
 
@@ -93,7 +99,8 @@ class Adaptive:
             raise ValueError(f"factor = {self.factor}; allowed: between 0 and 1")
 
     def run(self, attempt: Attempt) -> None:
-        if attempt(self.first, self.parameter, self.form) in (Outcome.ABORT, Outcome.FAILED):
+        outcome = attempt(self.first, self.parameter, self.form)
+        if outcome.final or outcome is Outcome.FAILED:
             return
         towards = math.copysign(1.0, math.log(self.last / self.first)) if self.last != self.first else 0.0
         value, halvings = self.first, 0
@@ -101,7 +108,7 @@ class Adaptive:
             step = -math.log(self.factor) / 2**halvings
             exponent = min(step, abs(math.log(self.last / value)))
             outcome = attempt(value * math.exp(towards * exponent), self.parameter, self.form, hold=True)
-            if outcome is Outcome.ABORT or outcome is Outcome.UNCHANGED:
+            if outcome.final or outcome is Outcome.UNCHANGED:
                 return
             if outcome is Outcome.SOLVED:
                 value, halvings = value * math.exp(towards * exponent), max(0, halvings - 1)
@@ -123,7 +130,7 @@ class Phases:
         def watched(value: float, parameter: str, form: Form | None, *, hold: bool = False) -> Outcome:
             nonlocal gone
             outcome = attempt(value, parameter, form, hold=hold)
-            gone = gone or outcome is Outcome.ABORT
+            gone = gone or outcome.final
             return outcome
 
         for phase in self.phases:

@@ -65,8 +65,11 @@ class Refinement(Protocol):
     reads_arcs: ClassVar[bool]  # whether the arcs of the curve it starts from matter
     exact: ClassVar[bool]  # whether what it solves is meant to be certified, or only sharper than before
 
-    def run(self, start: Curve, callback: MakeCallback | None = None) -> Refined:
-        """Refine a curve; never raises for want of convergence, the outcome says how it ended."""
+    def run(self, start: Curve, callback: MakeCallback | None = None, blunter: Curve | None = None) -> Refined:
+        """Refine a curve; never raises for want of convergence, the outcome says how it ended.
+
+        ``blunter`` is the solution of a larger smoothing, where there is one: the two tell where S goes without any.
+        """
         ...
 
 
@@ -111,8 +114,11 @@ class Segmentation:
         self, collocation: Collocation, start: Curve, callback: MakeCallback | None
     ) -> tuple[Curve, OptimizeResult]:
         """One round, from the projection of ``start``; of networks the output layers are solved for last."""
-        optimizer: Optimizer = LevenbergMarquardt(self.stopping, damping=self.damping, linear_solver=self.linear_solver)
-        if len(collocation.linear_unknowns) < collocation.n_unknowns:
+        deep = len(collocation.linear_unknowns) < collocation.n_unknowns
+        optimizer: Optimizer = LevenbergMarquardt(
+            self.stopping, damping=self.damping, linear_solver=self.linear_solver, ahead=not deep
+        )
+        if deep:
             optimizer = Chain([optimizer, OutputLayer()])
         on_iteration = callback(collocation) if callback else None
         result = optimizer.run(collocation, project(collocation, start), on_iteration)
@@ -166,7 +172,7 @@ class Subdivide(Segmentation):
 
     reads_arcs: ClassVar[bool] = False
 
-    def run(self, start: Curve, callback: MakeCallback | None = None) -> Refined:
+    def run(self, start: Curve, callback: MakeCallback | None = None, blunter: Curve | None = None) -> Refined:
         bvp, setting = start.collocation.bvp, start.collocation.setting
         rounds: list[OptimizeResult] = []
         disc = self.discretisation(bvp)

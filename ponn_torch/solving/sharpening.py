@@ -14,8 +14,9 @@ import torch
 from torch import Tensor
 
 from ponn_torch.optimal_control.curve import Curve
-from ponn_torch.solving.switching import grid, switching_along
+from ponn_torch.solving.switching import extrapolated, grid, smoothing_of, switching_along
 
+LEGIBLE = 0.5  # of the smoothing, by which S stays off zero where no arc is hidden
 RESOLUTION = 2.0  # change of asinh(2S/πρ) along one segment
 
 
@@ -47,6 +48,29 @@ def undecided(curve: Curve, smoothing: float) -> tuple[float, float]:
         for first, after in zip((edges == 1).nonzero(), (edges == -1).nonzero(), strict=True):
             longest = max(longest, (float(t[first]), float(t[after - 1])), key=lambda ends: ends[1] - ends[0])
     return longest
+
+
+def legible(curve: Curve, blunter: Curve) -> bool:
+    """Whether S shows the arcs that it has without smoothing: those that it is extrapolated to from a blunter curve.
+
+    It does if both stay off zero, by half the smoothing, wherever they turn round and at both ends.
+    """
+    t = curve.on_segments(curve.collocation.discretisation.nodes.between(200))[0]
+    now, then = switching_along(curve, t), extrapolated(curve, blunter)(t)
+    margin = LEGIBLE * smoothing_of(curve)
+    return _signs(now) == _signs(then) and all(bool((s[_turns(s)].abs() > margin).all()) for s in (now, then))
+
+
+def _signs(switching: Tensor) -> list[list[bool]]:
+    """The signs of S in the order they come."""
+    signs: list[list[bool]] = torch.unique_consecutive(switching > 0, dim=0).tolist()
+    return signs
+
+
+def _turns(switching: Tensor) -> Tensor:
+    """Where S (m, k) has a local extremum or an end."""
+    slope, ends = switching.diff(dim=0), switching.new_ones(1, switching.shape[1])
+    return torch.cat([ends, -slope[1:] * slope[:-1], ends]) >= 0
 
 
 def singular_interval(rungs: Sequence[tuple[float, tuple[float, float]]]) -> tuple[float, float] | None:

@@ -85,7 +85,7 @@ class SingleDomain(ABC):
     def discretisation(self, curve: Curve, layers: Layers) -> Discretisation:
         """Free function and nodes for a problem that has these layers, next to a curve."""
 
-    def run(self, start: Curve, callback: MakeCallback | None = None) -> Refined:
+    def run(self, start: Curve, callback: MakeCallback | None = None, blunter: Curve | None = None) -> Refined:
         rounds: list[OptimizeResult] = []
         kept, made_by, outcome = start, None, Outcome.RESIDUAL
 

@@ -7,7 +7,7 @@ start that fails is recognised early and the next one is tried; whatever was com
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import torch
@@ -27,6 +27,7 @@ from ponn_torch.optim.base import (
     Stopping,
     Stopwatch,
     loosened,
+    warm,
 )
 from ponn_torch.optim.least_squares import LevenbergMarquardt
 from ponn_torch.optimal_control.collocation import Collocation
@@ -42,13 +43,15 @@ from ponn_torch.solving.guess import Guess, RandomGuess, project
 from ponn_torch.solving.journal import Journal
 from ponn_torch.solving.observer import Observer, SilentObserver, StageResult
 from ponn_torch.solving.refinement import Refinement
+from ponn_torch.solving.sharpening import legible
 from ponn_torch.solving.solution import Solution
 from ponn_torch.solving.split import Split
 
 
 def _default_optimizer() -> Optimizer:
     return LevenbergMarquardt(
-        Stopping(tolerance=1e-9, decrease=1e-2, patience=2, max_iterations=150, hopeless=0.1, hopeless_after=60)
+        Stopping(tolerance=1e-9, decrease=1e-2, patience=2, max_iterations=150, hopeless=0.1, hopeless_after=60),
+        ahead=True,
     )
 
 
@@ -81,6 +84,7 @@ class Solver:
         n_starts: random starts to try at most; start i of seed s uses the random stream 1000 s + i.
         n_certified: stop at this many certified extremals and keep the cheapest; several extremals are real.
         start_limit: ‖r‖ of the first stage above which a start has failed.
+        warm_damping: first damping of a stage that starts from the one before, if the optimiser asks for more.
         stage_tolerance: ‖r‖ at which a stage ends that only leads to a refinement, if the optimiser asks for less.
         trust: a stage is kept while its off-node residual is below this fraction of the largest rate; below the
             resolution of the nodes the residual between them gives a broken stage away.
@@ -101,7 +105,8 @@ class Solver:
     n_starts: int = 10
     n_certified: int = 1
     start_limit: float = 0.1
-    stage_tolerance: float = 1e-4
+    warm_damping: float = 1e-5
+    stage_tolerance: float = 1e-3
     trust: float = 0.02
     mass_variable: str = "auto"
     data: Measurements | MeasurementFile | None = None
@@ -115,6 +120,8 @@ class Solver:
             value = getattr(self, name)
             if value < 1:
                 raise ValueError(f"{name} = {value}; allowed: at least 1")
+        if not self.warm_damping >= 0:
+            raise ValueError(f"warm_damping = {self.warm_damping}; allowed: a number ≥ 0")
         if not self.cpu_seconds > 0:
             raise ValueError(f"cpu_seconds = {self.cpu_seconds}; allowed: a positive number")
 
@@ -254,13 +261,14 @@ class _Run:
 
     def _one_start(self) -> tuple[Solution | None, str]:
         """Everything between a first guess and a trajectory to be judged; None and why where that fails."""
-        smoothed, message = self._continuation()
-        if smoothed is None:
+        stages, message = self._continuation()
+        if not stages:
             return None, message
+        smoothed = stages[-1]
         start = smoothed.curve.knots[0]
         if any(float((start - other).abs().max()) < 1e-5 * float(start.abs().max()) for other in self.refused):
             return None, f"start {self.start + 1} led to the same smoothed solution as one before: {self.note}"
-        refined, self.note = self._refined(smoothed)
+        refined, self.note = self._refined(stages)
         if self.note:
             self.refused.append(start)
         return refined, self.note
@@ -282,15 +290,17 @@ class _Run:
         return self.bvp.law.n_switching > 0 and not self.bvp.law.curved
 
     @property
+    def _reads_arcs(self) -> bool:
+        return self.solver.refinement is not None and self.solver.refinement.reads_arcs
+
+    @property
     def _stage_optimizer(self) -> Optimizer:
         """A refinement that reads arcs solves everything anew: digits of the curve it starts from are wasted."""
-        solver, refinement = self.solver, self.solver.refinement
-        if refinement is None or not refinement.reads_arcs:
-            return solver.optimizer
-        return loosened(solver.optimizer, solver.stage_tolerance)
+        solver = self.solver
+        return loosened(solver.optimizer, solver.stage_tolerance) if self._reads_arcs else solver.optimizer
 
-    def _continuation(self) -> tuple[Solution | None, str]:
-        """Walk the schedule from one start; the sharpest stage that can be trusted, or None and why."""
+    def _continuation(self) -> tuple[list[Solution], str]:
+        """Walk the schedule from one start; the stages that can be trusted, the sharpest last, or none and why."""
         solver, bvp = self.solver, self.bvp
         like = bvp.unit
         times = torch.linspace(0.0, 1.0, solver.n_segments + 1, dtype=like.dtype, device=like.device) * bvp.final_time
@@ -298,12 +308,12 @@ class _Run:
         if self._smoothable:
             current = current.with_setting(smoothing=1.0)
         xi = project(current, solver.guess.curve(bvp, 1000 * self.seed + self.start))
-        kept: Solution | None = None
+        kept: list[Solution] = []
         message = ""
         first = True
 
         def attempt(value: float, parameter: str, form: Form | None, *, hold: bool = False) -> Outcome:
-            nonlocal current, xi, kept, message, first
+            nonlocal current, xi, message, first
             if self.clock.spent and not first:
                 return Outcome.ABORT
             trial = replace(current, discretisation=self._discretisation(form))
@@ -312,7 +322,8 @@ class _Run:
             elif not first:
                 return Outcome.ABORT  # nothing to smooth: one stage is all there is
             try:
-                result = self._optimise("smooth", trial, xi, self._stage_optimizer)
+                optimizer = self._stage_optimizer if first else warm(self._stage_optimizer, solver.warm_damping)
+                result = self._optimise("smooth", trial, xi, optimizer)
             except NonFiniteResidual as error:
                 message = str(error)
                 return Outcome.ABORT if first else Outcome.FAILED
@@ -334,13 +345,15 @@ class _Run:
                 return Outcome.UNTRUSTED
             change = float((result.xi - xi).abs().max())
             current, xi = trial, result.xi
-            if trusted:
-                kept = solution
-            elif kept is None:
-                kept = solution
+            if trusted or not kept:
+                kept.append(solution)
+            if not trusted and len(kept) == 1:
                 message = "no stage solves its own problem between the nodes; the first one is kept"
             if change < 1e-6 * float(xi.abs().max()):
                 return Outcome.UNCHANGED
+            two = trusted and self._reads_arcs and self._smoothable and len(kept) > 1
+            if two and legible(solution.curve, kept[-2].curve):
+                return Outcome.LEGIBLE
             return Outcome.SOLVED if trusted else Outcome.UNTRUSTED
 
         solver.continuation.run(attempt)
@@ -360,14 +373,15 @@ class _Run:
 
     # -- refinement ---------------------------------------------------------------------------------------------------
 
-    def _refined(self, smoothed: Solution) -> tuple[Solution, str]:
+    def _refined(self, stages: Sequence[Solution]) -> tuple[Solution, str]:
         """The refined solution where the refinement succeeds or improves, else the smoothed one and why."""
-        refinement = self.solver.refinement
+        refinement, smoothed = self.solver.refinement, stages[-1]
         if refinement is None:
             return smoothed, ""
         name = type(refinement).__name__.lower()
         self.observer.stage_started(name, None, len(self.stages))
-        refined = refinement.run(smoothed.curve, self._callback)
+        blunter = stages[-2].curve if len(stages) > 1 and self._smoothable else None
+        refined = refinement.run(smoothed.curve, self._callback, blunter)
         improved = refined.curve is not smoothed.curve
         for result in refined.rounds:
             if not improved or result is not refined.result:

@@ -9,7 +9,7 @@ these are tried: a solved residual with the wrong arcs is an extremal of nothing
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -25,7 +25,14 @@ from ponn_torch.optimal_control.pontryagin import Setting
 from ponn_torch.optimal_control.problem import DisplayUnit
 from ponn_torch.solving.refinement import MakeCallback, Outcome, Refined, Segmentation, Segments
 from ponn_torch.solving.sharpening import graded_times, singular_interval, undecided
-from ponn_torch.solving.switching import Structure, claimed_structure, find_structure, needles, without_short_arcs
+from ponn_torch.solving.switching import (
+    Structure,
+    claimed_structure,
+    extrapolated,
+    find_structure,
+    needles,
+    without_short_arcs,
+)
 
 COLLAPSED = 1e-7  # fraction of the final time, below which an arc is solved away to nothing
 LEGIBLE = 1e-4  # ‖r‖ of a sharpened curve whose arcs are worth reading
@@ -58,25 +65,30 @@ class Split(Segmentation):
     max_sharpenings: int = 10
     sharpening: float = 0.5
 
-    def run(self, start: Curve, callback: MakeCallback | None = None) -> Refined:
+    def run(self, start: Curve, callback: MakeCallback | None = None, blunter: Curve | None = None) -> Refined:
         disc, rounds = self.discretisation(start.collocation.bvp), list[OptimizeResult]()
         read: list[tuple[Structure, int]] = []
-        rungs: list[tuple[float, tuple[float, float]]] = []
+        rungs: list[tuple[float, Curve]] = []
         refined = Refined(start, Outcome.STRUCTURE, rounds)
         for smoothed, n_segments in self._starts(disc, start, rounds, callback):
             if rounds and rounds[-1].status.cut:
                 return Refined(smoothed, Outcome.INTERRUPTED, rounds)
             smoothing = smoothed.collocation.setting.regime.smoothing
             if smoothing is not None:
-                rungs.append((float(smoothing), undecided(smoothed, float(smoothing))))
-            structure = find_structure(smoothed)
-            if any(structure.same_arcs(other) and n_segments == n for other, n in read):
-                continue
-            read.append((structure, n_segments))
-            refined = self._split(disc, smoothed, structure, n_segments, rounds, callback)
-            if refined.outcome in (Outcome.SOLVED, Outcome.INTERRUPTED):
-                return refined
-        singular = singular_interval(rungs)
+                rungs.append((float(smoothing), smoothed))
+            readings: list[Callable[[Tensor], Tensor] | None] = [None]
+            if blunter is not None and smoothing is not None:
+                readings.insert(0, extrapolated(smoothed, blunter))
+            blunter = smoothed
+            for switching in readings:
+                structure = find_structure(smoothed, switching)
+                if any(structure.same_arcs(other) and n_segments == n for other, n in read):
+                    continue
+                read.append((structure, n_segments))
+                refined = self._split(disc, smoothed, structure, n_segments, rounds, callback)
+                if refined.outcome in (Outcome.SOLVED, Outcome.INTERRUPTED):
+                    return refined
+        singular = singular_interval([(value, undecided(curve, value)) for value, curve in rungs])
         if singular is None:
             return refined
         unit = start.collocation.bvp.problem.display.get("time", DisplayUnit("s"))

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from itertools import pairwise
 
 import torch
@@ -53,10 +55,40 @@ def grid(curve: Curve, n_points: int = 400) -> tuple[Tensor, Tensor]:
     return curve.on_segments(z)[:2]
 
 
-def find_structure(curve: Curve, n_points: int = 1000, polish: int = 4) -> Structure:
-    """Zeros of S on a fine grid, polished by false position, and the arcs that S asks for."""
+def smoothing_of(curve: Curve) -> float:
+    """ρ of a curve's regime, 0 where it has none."""
+    value = curve.collocation.setting.regime.smoothing
+    return 0.0 if value is None else float(value)
+
+
+def extrapolated(curve: Curve, blunter: Curve) -> Callable[[Tensor], Tensor]:
+    """S without smoothing at scaled times (m,), by Richardson's rule from two solutions of different smoothing.
+
+    S moves with ρ nearly in proportion, and much: arcs that S(ρ) does not show yet, as it touches zero only at a
+    smaller ρ, are there in what it moves towards (Earth–Mars: all five from ρ = 1 and 0.3, of which each shows three).
+    """
+    smoothing, larger = (smoothing_of(one) for one in (curve, blunter))
+    share, stretch = smoothing / (larger - smoothing), blunter.times[-1] / curve.times[-1]
+
+    def switching(t: Tensor) -> Tensor:
+        s = switching_along(curve, t)
+        return s + share * (s - switching_along(blunter, stretch * t))
+
+    return switching
+
+
+def find_structure(
+    curve: Curve, switching: Callable[[Tensor], Tensor] | None = None, *, n_points: int = 1000, polish: int = 4
+) -> Structure:
+    """Zeros of S on a fine grid, polished by false position, and the arcs that S asks for.
+
+    ``switching`` is S at scaled times, where it is not to be the curve's own.
+    """
     t, w = grid(curve, max(100, n_points // curve.collocation.n_segments))
-    s = switching_along(curve, t, w)
+    if switching is None:
+        s, switching = switching_along(curve, t, w), partial(switching_along, curve)
+    else:
+        s = switching(t)
     law = curve.collocation.bvp.law
     # S > 0 decides the arc, so a zero is where that changes; shared knots appear twice and change nothing
     row, event = ((s[1:] > 0) != (s[:-1] > 0)).nonzero(as_tuple=True)
@@ -64,7 +96,7 @@ def find_structure(curve: Curve, n_points: int = 1000, polish: int = 4) -> Struc
     root, side = low, torch.zeros_like(event)
     for _ in range(polish if len(row) else 0):
         root = (low * s_high - high * s_low) / (s_high - s_low)
-        s_root = switching_along(curve, root).gather(1, event[:, None])[:, 0]
+        s_root = switching(root).gather(1, event[:, None])[:, 0]
         left = (s_root > 0) == (s_low > 0)
         # Illinois: S is halved at an end that stays twice, so that both ends move
         before, side = side, torch.where(left, 1, -1)
@@ -75,7 +107,7 @@ def find_structure(curve: Curve, n_points: int = 1000, polish: int = 4) -> Struc
     root, event = root[order], event[order]
     ends = torch.cat([curve.times[:1], root, curve.times[-1:]])
     middle = 0.5 * (ends[1:] + ends[:-1])
-    arcs = law.arc_codes(switching_along(curve, middle))
+    arcs = law.arc_codes(switching(middle))
     keep = (arcs[1:] != arcs[:-1]).any(-1)
     arcs = torch.cat([arcs[:1], arcs[1:][keep]])
     structure = Structure(arcs, root[keep], tuple(event[keep].tolist()))

@@ -41,7 +41,7 @@ class TwoLoop(Segmentation):
     n_nodes: int = 44
     max_rounds: int = 200
 
-    def run(self, start: Curve, callback: MakeCallback | None = None) -> Refined:
+    def run(self, start: Curve, callback: MakeCallback | None = None, blunter: Curve | None = None) -> Refined:
         structure, parameters = find_structure(start), start.collocation.setting.parameters
         collocation = Collocation.on_segments(
             self.discretisation(start.collocation.bvp),

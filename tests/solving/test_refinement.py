@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import cache
+from itertools import pairwise
 
 import pytest
 import torch
@@ -20,9 +21,10 @@ from ponn_torch.optimal_control.discretisation import Discretisation
 from ponn_torch.optimal_control.pontryagin import Setting
 from ponn_torch.solving.guess import RandomGuess, project
 from ponn_torch.solving.refinement import Outcome, Subdivide
+from ponn_torch.solving.sharpening import legible
 from ponn_torch.solving.solution import Solution
 from ponn_torch.solving.split import Split
-from ponn_torch.solving.switching import find_structure
+from ponn_torch.solving.switching import extrapolated, find_structure
 
 OPTIMA = {"earth_mars": 396.05984393, "mars_landing": 268.0146563274}
 
@@ -62,6 +64,18 @@ def test_an_extremal_with_too_few_arcs_is_seen_by_the_sign_of_s():
     assert Solution(curve).cost == pytest.approx(400.011, abs=1e-3)
     assert curve.off_node_residual() < 1e-6
     assert find_structure(curve).arcs.flatten().tolist() == [2, 0, 2, 0, 2]
+
+
+def test_two_blunt_curves_tell_the_arcs_that_neither_shows():
+    sharp, blunt = smoothed("earth_mars", 0.3), smoothed("earth_mars", 1.0)
+    assert len(find_structure(sharp)) == len(find_structure(blunt)) == 3
+    assert find_structure(sharp, extrapolated(sharp, blunt)).arcs.flatten().tolist() == [2, 0, 2, 0, 2]
+    assert not legible(sharp, blunt)
+
+
+def test_arcs_are_legible_once_both_the_curve_and_what_it_leads_to_stay_off_zero():
+    landing = [smoothed("mars_landing", rho) for rho in (1.0, 0.3, 0.1)]
+    assert [legible(sharp, blunt) for blunt, sharp in pairwise(landing)] == [False, True]
 
 
 @pytest.mark.parametrize("name", OPTIMA)

@@ -23,6 +23,7 @@ from ponn_torch.solving.guess import project
 from ponn_torch.solving.switching import (
     Structure,
     claimed_structure,
+    extrapolated,
     find_structure,
     needles,
     switching_along,
@@ -51,6 +52,20 @@ def test_zeros_are_found_to_round_off():
     assert structure.arcs.flatten().tolist() == [UPPER, LOWER, UPPER]
     assert structure.events == (0, 0)
     assert structure.times.tolist() == pytest.approx([PUSH, 3 - PUSH], abs=1e-13)
+
+
+def test_arcs_that_no_smoothed_curve_shows_are_extrapolated():
+    """S = |λv| − 1 touches zero from one side at both smoothings, and crosses it where they lead to."""
+
+    def smoothed(smoothing: float) -> Curve:
+        curve = with_costate(lambda t: 1.0 - 0.02 + smoothing * 0.1 + 0.1 * (t - 1.5) ** 2)
+        return Curve(curve.collocation.with_setting(smoothing=smoothing), curve.xi)
+
+    sharp, blunt = smoothed(0.3), smoothed(1.0)
+    assert len(find_structure(sharp)) == len(find_structure(blunt)) == 1
+    structure = find_structure(sharp, extrapolated(sharp, blunt))
+    assert structure.arcs.flatten().tolist() == [UPPER, LOWER, UPPER]
+    assert structure.times.tolist() == pytest.approx([1.5 - 0.2**0.5, 1.5 + 0.2**0.5], abs=1e-10)
 
 
 def test_curved_switching_functions_are_polished():
