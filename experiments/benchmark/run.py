@@ -4,20 +4,21 @@ from __future__ import annotations
 
 import argparse
 import statistics
-import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import torch
 from torch.func import jacfwd, jacrev
 
 from experiments.benchmark.methods import methods
+from experiments.benchmark.profile import iterations, neighbours
+from experiments.benchmark.timing import columns, cpu_times
 from experiments.solves import PROBLEMS, row
 from experiments.tables import Report, markdown, share, spread, write
 from ponn_torch.ansatz.basis import Chebyshev
 from ponn_torch.optimal_control.collocation import Collocation
+from ponn_torch.optimal_control.linearisation import linearise
 from ponn_torch.optimal_control.pontryagin import pontryagin
 from ponn_torch.solving.guess import project
 from ponn_torch.solving.solver import Solver
@@ -25,18 +26,6 @@ from ponn_torch.solving.solver import Solver
 FOLDER = Path(__file__).parent
 SIZES = {"earth_mars": (70, 140), "mars_landing": (30, 120)}  # L, n of the PoNN paper, one segment
 GOAL = 10.0  # jacrev over linearise
-
-
-def cpu_times(calls: Mapping[str, Callable[[], Any]], repeats: int) -> dict[str, list[float]]:
-    """CPU seconds per call after a warm-up; one of each in turn, so that a busy machine slows all of them."""
-    out: dict[str, list[float]] = {name: [] for name in calls}
-    for repeat in range(repeats + 1):
-        for name, call in calls.items():
-            began = time.process_time()
-            call()
-            if repeat:
-                out[name].append(time.process_time() - began)
-    return out
 
 
 def linearisation(repeats: int) -> Report:
@@ -50,7 +39,7 @@ def linearisation(repeats: int) -> Report:
             for i, value in enumerate(values)
         ]
         lines.append(line)
-    text = f"{repeats} calls of each in turn; median [min, max].\n\n{markdown(_columns(lines))}"
+    text = f"{repeats} calls of each in turn; median [min, max].\n\n{markdown(columns(lines))}"
     return Report({"linearisation": rows}, text)
 
 
@@ -73,7 +62,7 @@ def _linearisation_of(name: str, repeats: int) -> tuple[dict[str, list[float]], 
     times = cpu_times(
         {
             "residual": lambda: residual.residual(xi),
-            "linearise": lambda: residual.linearise(xi),
+            "linearise": lambda: linearise(residual, xi),
             "jacrev": lambda: jacrev(residual.residual)(xi),
             "jacfwd": lambda: jacfwd(residual.residual)(xi),
             "Cholesky step": lambda: step("cholesky"),
@@ -96,12 +85,6 @@ def _linearisation_of(name: str, repeats: int) -> tuple[dict[str, list[float]], 
         "largest difference of the Jacobians, relative": f"{difference:.0e}",
     }
     return times, line
-
-
-def _columns(lines: Sequence[Mapping[str, str]]) -> list[dict[str, str]]:
-    """Rows ↔ columns."""
-    first, *others = lines[0]
-    return [{first: key, **{line[first]: line[key] for line in lines}} for key in others]
 
 
 def solves(n_seeds: int) -> Report:
@@ -133,13 +116,15 @@ def solves(n_seeds: int) -> Report:
                 "fuel − known optimum, kg": spread((r["fuel_kg"] - problem.known_cost for r in mine), "+.0e"),
             }
         )
-    text = f"Seeds 0–{n_seeds - 1}; median [min, max].\n\n{markdown(_columns(lines))}"
+    text = f"Seeds 0–{n_seeds - 1}; median [min, max].\n\n{markdown(columns(lines))}"
     return Report({"solves": rows}, text)
 
 
 PARTS: dict[str, tuple[Callable[[int], Report], str]] = {
     "linearisation": (linearisation, "repeats"),
+    "iterations": (iterations, "repeats"),
     "solves": (solves, "seeds"),
+    "neighbours": (neighbours, "repeats"),
     "methods": (methods, "seeds"),
 }
 
