@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from ponn_torch.optimal_control.curve import Curve
-from ponn_torch.solving.switching import extrapolated, grid, smoothing_of, switching_along
+from ponn_torch.solving.switching import grid, share_of_change, smoothing_of, switching_along
 
 LEGIBLE = 0.5  # of the smoothing, by which S stays off zero where no arc is hidden
 RESOLUTION = 2.0  # change of asinh(2S/πρ) along one segment
@@ -53,12 +53,19 @@ def undecided(curve: Curve, smoothing: float) -> tuple[float, float]:
 def legible(curve: Curve, blunter: Curve) -> bool:
     """Whether S shows the arcs that it has without smoothing: those that it is extrapolated to from a blunter curve.
 
-    It does if both stay off zero, by half the smoothing, wherever they turn round and at both ends.
+    It does if both stay off zero, by half the smoothing, wherever they turn round and at both ends. Both curves lie on
+    the same segments.
     """
-    t = curve.on_segments(curve.collocation.discretisation.nodes.between(200))[0]
-    now, then = switching_along(curve, t), extrapolated(curve, blunter)(t)
+    now, before = (_sampled(one) for one in (curve, blunter))
+    then = now + share_of_change(curve, blunter) * (now - before)
     margin = LEGIBLE * smoothing_of(curve)
     return _signs(now) == _signs(then) and all(bool((s[_turns(s)].abs() > margin).all()) for s in (now, then))
+
+
+def _sampled(curve: Curve) -> Tensor:
+    """Switching functions (m, n_switching) between the nodes."""
+    t, w, _, _ = curve.on_segments(curve.collocation.discretisation.nodes.between(200))
+    return switching_along(curve, t, w)
 
 
 def _signs(switching: Tensor) -> list[list[bool]]:

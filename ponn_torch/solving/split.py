@@ -81,7 +81,7 @@ class Split(Segmentation):
                 readings.insert(0, extrapolated(smoothed, blunter))
             blunter = smoothed
             for switching in readings:
-                structure = find_structure(smoothed, switching)
+                structure = find_structure(smoothed, switching, polish=4 if switching is None else 1)
                 if any(structure.same_arcs(other) and n_segments == n for other, n in read):
                     continue
                 read.append((structure, n_segments))

@@ -61,14 +61,19 @@ def smoothing_of(curve: Curve) -> float:
     return 0.0 if value is None else float(value)
 
 
+def share_of_change(curve: Curve, blunter: Curve) -> float:
+    """By how much of its change from a blunter curve a quantity that is linear in ρ changes on the way to ρ = 0."""
+    smoothing, larger = (smoothing_of(one) for one in (curve, blunter))
+    return smoothing / (larger - smoothing)
+
+
 def extrapolated(curve: Curve, blunter: Curve) -> Callable[[Tensor], Tensor]:
     """S without smoothing at scaled times (m,), by Richardson's rule from two solutions of different smoothing.
 
     S moves with ρ nearly in proportion, and much: arcs that S(ρ) does not show yet, as it touches zero only at a
     smaller ρ, are there in what it moves towards (Earth–Mars: all five from ρ = 1 and 0.3, of which each shows three).
     """
-    smoothing, larger = (smoothing_of(one) for one in (curve, blunter))
-    share, stretch = smoothing / (larger - smoothing), blunter.times[-1] / curve.times[-1]
+    share, stretch = share_of_change(curve, blunter), blunter.times[-1] / curve.times[-1]
 
     def switching(t: Tensor) -> Tensor:
         s = switching_along(curve, t)
@@ -82,7 +87,7 @@ def find_structure(
 ) -> Structure:
     """Zeros of S on a fine grid, polished by false position, and the arcs that S asks for.
 
-    ``switching`` is S at scaled times, where it is not to be the curve's own.
+    ``switching`` is S at scaled times, where it is not to be the curve's own; such a guess is hardly worth polishing.
     """
     t, w = grid(curve, max(100, n_points // curve.collocation.n_segments))
     if switching is None:
