@@ -9,7 +9,7 @@ these are tried: a solved residual with the wrong arcs is an extremal of nothing
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -76,12 +76,13 @@ class Split(Segmentation):
             smoothing = smoothed.collocation.setting.regime.smoothing
             if smoothing is not None:
                 rungs.append((float(smoothing), smoothed))
-            readings: list[Callable[[Tensor], Tensor] | None] = [None]
+            structures = [find_structure(smoothed)]
             if blunter is not None and smoothing is not None:
-                readings.insert(0, extrapolated(smoothed, blunter))
+                guessed = find_structure(smoothed, extrapolated(smoothed, blunter), polish=1)
+                # of the same arcs the curve's own times fit it better
+                structures = structures if guessed.same_arcs(structures[0]) else [guessed, *structures]
             blunter = smoothed
-            for switching in readings:
-                structure = find_structure(smoothed, switching, polish=4 if switching is None else 1)
+            for structure in structures:
                 if any(structure.same_arcs(other) and n_segments == n for other, n in read):
                     continue
                 read.append((structure, n_segments))
