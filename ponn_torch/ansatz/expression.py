@@ -194,11 +194,22 @@ class ConstrainedExpression(nn.Module):
         Minimises Σ_i weights_i |y(z_i) - y_i|² + ridge |β|², weights (n,) by default 1, by the singular value
         decomposition of the table: singular values below round-off are dropped, which gives the shortest β.
         """
+        return self.fitter(z, weights=weights, ridge=ridge)(y, kappa)
+
+    def fitter(
+        self, z: Tensor, *, weights: Tensor | None = None, ridge: float = 0.0
+    ) -> Callable[[Tensor, Tensor], Tensor]:
+        """(y, κ) → β as ``fit`` gives it, for many values at the same points: the table is decomposed once."""
         root = torch.ones_like(z) if weights is None else weights.sqrt()
-        rest = root[:, None] * (y - self.jet(y.new_zeros(self.size, y.shape[-1]), kappa, z, 0)[..., 0, :, :])
-        table = self.tables(z, 0)[0][0]
+        B, Omega = (table[0] for table in self.tables(z, 0))
         if self.n_variables == 1:
-            return least_squares(root[:, None] * table, rest, ridge)
-        matrix = (root[:, None, None, None] * table).flatten(2).flatten(0, 1)  # rows (n, v), columns (L', u)
-        solution = least_squares(matrix, rest.flatten(-2).unsqueeze(-1), ridge)
-        return solution.squeeze(-1).unflatten(-1, (self.size, self.n_variables))
+            solve = least_squares(root[:, None] * B, ridge)
+            return lambda y, kappa: solve(root[:, None] * (y - Omega @ kappa))
+        solve = least_squares((root[:, None, None, None] * B).flatten(2).flatten(0, 1), ridge)  # rows (n, v), (L', u)
+
+        def fit(y: Tensor, kappa: Tensor) -> Tensor:
+            rest = root[:, None] * (y - torch.einsum("nvk,...k->...nv", Omega, kappa))
+            solution = solve(rest.flatten(-2).unsqueeze(-1))
+            return solution.squeeze(-1).unflatten(-1, (self.size, self.n_variables))
+
+        return fit

@@ -15,13 +15,16 @@ import torch
 from torch import Tensor
 
 
-def least_squares(matrix: Tensor, target: Tensor, ridge: float = 0.0) -> Tensor:
-    """The shortest X (..., N, d) of least ‖M X − target‖² + ridge ‖X‖²; singular values below round-off are dropped."""
+def least_squares(matrix: Tensor, ridge: float = 0.0) -> Callable[[Tensor], Tensor]:
+    """target (..., R, d) → the shortest X (..., N, d) of least ‖M X − target‖² + ridge ‖X‖², M factored once.
+
+    Singular values below round-off are dropped.
+    """
     # the SVD and not torch's lstsq, whose drivers for deficient rank exist on the CPU only
     left, singular, right = torch.linalg.svd(matrix, full_matrices=False)
     round_off = torch.finfo(matrix.dtype).eps * max(matrix.shape) * singular[0]
     inverse = torch.where(singular > round_off, singular / (singular**2 + ridge), 0.0)
-    return right.T @ (inverse[:, None] * (left.T @ target))
+    return lambda target: right.T @ (inverse[:, None] * (left.T @ target))
 
 
 def _cholesky_solve(matrix: Tensor, scale: Tensor, damping: Tensor, right: Tensor) -> Tensor:

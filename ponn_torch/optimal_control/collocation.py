@@ -114,6 +114,12 @@ class Collocation:
         return self.discretisation.bvp
 
     @property
+    def smoothing(self) -> float:
+        """ρ of the regime, 0 where the control is not smoothed."""
+        value = self.setting.regime.smoothing
+        return 0.0 if value is None else float(value)
+
+    @property
     def n_segments(self) -> int:
         return self.known_times.shape[-1] - 1
 

@@ -33,6 +33,11 @@ class Curve:
         return self.unknowns.times
 
     @property
+    def smoothing(self) -> float:
+        """ρ, 0 where the control is not smoothed."""
+        return self.collocation.smoothing
+
+    @property
     def knots(self) -> Tensor:
         """Scaled w at the knots (K+1, 2n)."""
         return self.unknowns.knots

@@ -124,7 +124,7 @@ class DeepExpressions:
             for d, head in enumerate(range(heads.start, heads.stop)):
                 net = table[0 if self.network.shared else head]
                 ridge = (_RIDGE * float(torch.linalg.matrix_norm(net, 2))) ** 2
-                output[..., head] = least_squares(net, rest[..., d].mT, ridge).mT
+                output[..., head] = least_squares(net, ridge)(rest[..., d].mT).mT
         in_nets = output if self.network.shared else output.mT
         weights[..., self.output_layer] = in_nets.flatten(-2)
         return weights

@@ -10,6 +10,7 @@ from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -184,3 +185,21 @@ class Discretisation:
                 depends = self.bvp.couplings[group.columns[:, -1]][:, other.columns].any(0).any(0).tolist()
                 out[i, j] = [] if group.trivial else [e for e in range(other.order) if depends[e]]
         return out
+
+
+def discretise(
+    bvp: BoundaryValueProblem, basis: FreeFunction, nodes: NodeSet, form: Form, conditioning: str
+) -> Discretisation:
+    """The same object for the same parts: tables and tapes of one solve serve the next."""
+    if isinstance(basis, LinearBasis) and not dict(basis.named_buffers()):
+        basis = _made_once(type(basis), tuple(basis.arguments.items()))
+    return _discretise(bvp, basis, nodes, form, conditioning)
+
+
+@lru_cache(maxsize=64)
+def _made_once(kind: type[LinearBasis], arguments: tuple[tuple[str, Any], ...]) -> LinearBasis:
+    """A basis that draws nothing: its arguments say all."""
+    return kind(**dict(arguments))
+
+
+_discretise = lru_cache(maxsize=32)(Discretisation)

@@ -6,9 +6,9 @@ the weights from that with respect to y, and a fit. Linear free functions answer
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from typing import TYPE_CHECKING, Any, Protocol
 
 import torch
@@ -62,13 +62,34 @@ class Expressions(Protocol):
 
 
 @dataclass(frozen=True, eq=False)
+class _AtNodes:
+    """A constrained expression with what it is at the nodes: B (q+1, n, L), and its least-squares fit to values."""
+
+    expression: ConstrainedExpression
+    nodes: NodeSet
+    order: int
+
+    @cached_property
+    def B(self) -> Tensor:
+        return self.expression.tables(self.nodes.points, self.order)[0]
+
+    @cached_property
+    def fit(self) -> Callable[[Tensor, Tensor], Tensor]:
+        return self.expression.fitter(self.nodes.points, weights=self.nodes.weights, ridge=1e-18)
+
+
+@dataclass(frozen=True, eq=False)
 class _Tables:
     """What the chains of a group share: B (q+1, n, L), [B | Ω] as (L + 2q, (q+1) n), and where their β stand."""
 
-    expression: ConstrainedExpression
+    made: _AtNodes
     B: Tensor
     both: Tensor
     own: slice
+
+    @property
+    def expression(self) -> ConstrainedExpression:
+        return self.made.expression
 
     @property
     def size(self) -> int:
@@ -88,13 +109,13 @@ class LinearExpressions:
             how = self.nodes, group.order, discretisation.conditioning
             given = discretisation.combinations.get(group.order)
             if given is None and not dict(basis.named_buffers()):
-                expression, B = _made_once(type(basis), tuple(basis.arguments.items()), *how)
+                made = _made_once(type(basis), tuple(basis.arguments.items()), *how)
             else:
-                expression, B = _expression(basis, *how, given)
-            B = _free(group, B)
+                made = _made(basis, *how, given)
+            B = _free(group, made.B)
             both = torch.cat([B, group.Omega], -1).movedim(-1, 0).flatten(1)
             start = tables[-1].own.stop if tables else 0
-            tables.append(_Tables(expression, B, both, slice(start, start + group.n_chains * B.shape[-1])))
+            tables.append(_Tables(made, B, both, slice(start, start + group.n_chains * B.shape[-1])))
         self.tables = tuple(tables)
         self._kept: dict[tuple[int, int], tuple[Tensor, Tensor]] = {}
         self.output_layer = torch.arange(self.n_own, device=self.nodes.points.device)
@@ -167,20 +188,16 @@ class LinearExpressions:
 
     def fit(self, values: Sequence[Tensor], kappas: Sequence[Tensor]) -> Tensor:
         weights = values[0].new_zeros(*values[0].shape[:-2], self.n_own)
-        nodes = self.nodes
         for i, group in enumerate(self.groups):
             if not group.trivial:
-                fitted = self.tables[i].expression.fit(
-                    nodes.points, values[i], kappas[i].mT, weights=nodes.weights, ridge=1e-18
-                )
-                self.beta(i, weights).copy_(fitted.mT)
+                self.beta(i, weights).copy_(self.tables[i].made.fit(values[i], kappas[i].mT).mT)
         return weights
 
 
-def _expression(
+def _made(
     basis: LinearBasis, nodes: NodeSet, order: int, conditioning: str, combinations: Tensor | None = None
-) -> tuple[ConstrainedExpression, Tensor]:
-    """Around the functions that a chain's Hermite constraints do not span; and B (q+1, n, L) at the nodes."""
+) -> _AtNodes:
+    """Around the functions that a chain's Hermite constraints do not span."""
     points = nodes.points
     expression = ConstrainedExpression(
         basis.beyond(2 * order),
@@ -192,15 +209,15 @@ def _expression(
         dtype=points.dtype,
         device=points.device,
     )
-    return expression, expression.tables(points, order)[0]
+    return _AtNodes(expression, nodes, order)
 
 
 @lru_cache(maxsize=64)
 def _made_once(
     kind: type[LinearBasis], arguments: tuple[tuple[str, Any], ...], nodes: NodeSet, order: int, conditioning: str
-) -> tuple[ConstrainedExpression, Tensor]:
+) -> _AtNodes:
     """The same for all problems, where the basis draws nothing: its arguments say all."""
-    return _expression(kind(**dict(arguments)), nodes, order, conditioning)
+    return _made(kind(**dict(arguments)), nodes, order, conditioning)
 
 
 def _free(group: Group, table: Tensor) -> Tensor:

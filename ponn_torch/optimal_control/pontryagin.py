@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Any
 
 import torch
@@ -44,7 +44,7 @@ class Chain:
     trivial: bool = False
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class BoundaryValueProblem:
     """State–costate equations ẇ = F(t, w) with what is known of w at both ends, scaled to O(1).
 
@@ -249,6 +249,7 @@ class BoundaryValueProblem:
 # -- building --------------------------------------------------------------------------------------------------------
 
 
+@lru_cache(maxsize=16)
 @torch.no_grad()
 def pontryagin(
     problem: OptimalControlProblem,
@@ -259,6 +260,8 @@ def pontryagin(
     device: torch.device | str = "cpu",
 ) -> BoundaryValueProblem:
     """Derive the boundary value problem; ``mass_variable`` is one of MASS_VARIABLES, ``chains`` merges ṙ = v.
+
+    Asked for again it is the same object, with all that was tabulated and recorded on it.
 
     ``auto`` takes the logarithm of a mass where the problem names one: it keeps the mass positive, which decides
     whether a random start converges (Earth–Mars: 16 of 16 against 9 of 16 with the mass itself).

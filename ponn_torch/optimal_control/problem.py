@@ -54,7 +54,7 @@ class ProblemOrigin:
     arguments: Mapping[str, Any] = field(default_factory=dict)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class OptimalControlProblem:
     """Minimise terminal_cost + ∫ running_cost dt subject to ẋ = dynamics(t, x, u, p), u in the control set.
 

@@ -54,10 +54,9 @@ class Family:
         Raises:
             ValueError: a smoothed curve.
         """
-        if curve.collocation.setting.regime.smoothing is not None:
+        if curve.smoothing:
             raise ValueError(
-                f"smoothing = {float(curve.collocation.setting.regime.smoothing):g}; allowed: a split or an unbounded "
-                "control, of which the arcs are known"
+                f"smoothing = {curve.smoothing:g}; allowed: a split or an unbounded control, whose arcs are known"
             )
         made = curve.collocation
         batched = replace(made, known_knots=made.known_knots[None], known_times=made.known_times[None])

@@ -13,7 +13,7 @@ from ponn_torch.ansatz.basis import Chebyshev
 from ponn_torch.numerics.nodes import make_nodes
 from ponn_torch.optimal_control.collocation import Collocation, Unknowns
 from ponn_torch.optimal_control.curve import Curve
-from ponn_torch.optimal_control.discretisation import Discretisation, Strong
+from ponn_torch.optimal_control.discretisation import Strong, discretise
 from ponn_torch.optimal_control.expressions import LinearExpressions
 from ponn_torch.optimal_control.pontryagin import BoundaryValueProblem
 
@@ -79,7 +79,7 @@ class RandomGuess:
     def curve(self, bvp: BoundaryValueProblem, seed: int) -> ScaledCurve:
         like = bvp.unit
         nodes = make_nodes("legendre_gauss", 2 * self.n_neurons, dtype=like.dtype, device=like.device)
-        disc = Discretisation(bvp, Chebyshev(self.n_neurons), nodes, Strong(), "columns")
+        disc = discretise(bvp, Chebyshev(self.n_neurons), nodes, Strong(), "columns")
         expressions = disc.expressions
         assert isinstance(expressions, LinearExpressions)  # as Chebyshev polynomials are linear
         collocation = Collocation.on_segments(disc, like.new_tensor([0.0, bvp.final_time]))

@@ -22,7 +22,7 @@ from ponn_torch.optim.chain import Chain, OutputLayer
 from ponn_torch.optim.least_squares import LevenbergMarquardt
 from ponn_torch.optimal_control.collocation import Collocation
 from ponn_torch.optimal_control.curve import Curve
-from ponn_torch.optimal_control.discretisation import Discretisation
+from ponn_torch.optimal_control.discretisation import Discretisation, Strong, discretise
 from ponn_torch.optimal_control.pontryagin import BoundaryValueProblem
 from ponn_torch.solving.guess import project
 
@@ -108,7 +108,7 @@ class Segmentation:
         nodes = make_nodes("legendre_gauss", self.n_nodes, dtype=bvp.unit.dtype, device=bvp.unit.device)
         basis = self.basis if isinstance(self.basis, FreeFunction) else self.basis(self.n_neurons)
         basis = basis.to(dtype=bvp.unit.dtype, device=bvp.unit.device)
-        return Discretisation(bvp, basis, nodes, conditioning="orthonormal")
+        return discretise(bvp, basis, nodes, Strong(), "orthonormal")
 
     def solve(
         self, collocation: Collocation, start: Curve, callback: MakeCallback | None

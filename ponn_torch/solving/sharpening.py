@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from ponn_torch.optimal_control.curve import Curve
-from ponn_torch.solving.switching import grid, share_of_change, smoothing_of, switching_along
+from ponn_torch.solving.switching import grid, share_of_change, switching_along
 
 LEGIBLE = 0.5  # of the smoothing, by which S stays off zero where no arc is hidden
 RESOLUTION = 2.0  # change of asinh(2S/πρ) along one segment
@@ -58,7 +58,7 @@ def legible(curve: Curve, blunter: Curve) -> bool:
     """
     now, before = (_sampled(one) for one in (curve, blunter))
     then = now + share_of_change(curve, blunter) * (now - before)
-    margin = LEGIBLE * smoothing_of(curve)
+    margin = LEGIBLE * curve.smoothing
     return _signs(now) == _signs(then) and all(bool((s[_turns(s)].abs() > margin).all()) for s in (now, then))
 
 

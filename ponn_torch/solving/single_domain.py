@@ -108,12 +108,10 @@ class SingleDomain(ABC):
             outcome = Outcome.SOLVED if off_node <= self.off_node_tolerance else Outcome.COARSE
             return Step.SOLVED
 
-        smoothing = start.collocation.setting.regime.smoothing
-        if smoothing is None:
-            attempt(None, "smoothing", None)
+        if start.smoothing:
+            Adaptive(start.smoothing, min(self.last, start.smoothing), self.factor, self.max_halvings).run(attempt)
         else:
-            first = float(smoothing)
-            Adaptive(first, min(self.last, first), self.factor, self.max_halvings).run(attempt)
+            attempt(None, "smoothing", None)
         return Refined(kept, outcome, rounds, made_by=made_by)
 
     def _rung(

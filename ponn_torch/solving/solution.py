@@ -67,7 +67,7 @@ class Solution:
         if self.curve.xi.dim() != 1:
             raise ValueError(f"xi has shape {tuple(self.curve.xi.shape)}; a Solution holds one curve, shape (N,)")
         regime = self.curve.collocation.setting.regime
-        if self._jumps and regime.arcs is None and regime.smoothing is None:
+        if self._jumps and regime.arcs is None and not self.curve.smoothing:
             raise ValueError(
                 f"{self.problem.name}: its optimal control jumps, so the setting needs a smoothing or arcs"
             )
@@ -106,8 +106,7 @@ class Solution:
     @property
     def smoothing(self) -> float | None:
         """ρ of a smoothed solution; None where no regulariser is in force."""
-        smoothing = self.curve.collocation.setting.regime.smoothing
-        return float(smoothing) if self.kind == "smoothed" and smoothing is not None else None
+        return self.curve.smoothing if self.kind == "smoothed" else None
 
     @property
     def arcs(self) -> list[str]:

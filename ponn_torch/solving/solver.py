@@ -32,7 +32,7 @@ from ponn_torch.optim.base import (
 from ponn_torch.optim.least_squares import LevenbergMarquardt
 from ponn_torch.optimal_control.collocation import Collocation
 from ponn_torch.optimal_control.curve import Curve
-from ponn_torch.optimal_control.discretisation import Discretisation, Form, Strong
+from ponn_torch.optimal_control.discretisation import Discretisation, Form, Strong, discretise
 from ponn_torch.optimal_control.measurements import Measured, MeasurementFile, Measurements
 from ponn_torch.optimal_control.pontryagin import BoundaryValueProblem, pontryagin
 from ponn_torch.optimal_control.problem import OptimalControlProblem
@@ -147,7 +147,7 @@ class Solver:
         like = bvp.unit
         nodes = make_nodes(self.node_kind, self.n_nodes, dtype=like.dtype, device=like.device)
         basis = self.basis.to(dtype=like.dtype, device=like.device)
-        return Discretisation(bvp, basis, nodes, form or self.form, self.conditioning)
+        return discretise(bvp, basis, nodes, form or self.form, self.conditioning)
 
 
 @dataclass(frozen=True)
@@ -408,7 +408,7 @@ class _Run:
         return on_iteration
 
     def _optimise(self, name: str, collocation: Collocation, xi: Tensor, optimizer: Optimizer) -> OptimizeResult:
-        self.observer.stage_started(name, _smoothing(collocation), len(self.stages))
+        self.observer.stage_started(name, collocation.smoothing or None, len(self.stages))
         measured = self.measurements
         residual: Residual = collocation if measured is None else Measured(collocation, measured)
         told = self._callback(collocation, residual)
@@ -425,7 +425,7 @@ class _Run:
         solution = Solution(curve)
         self._stage(
             name,
-            _smoothing(curve.collocation),
+            curve.smoothing or None,
             result,
             solution.off_node_residual,
             float(curve.collocation.cost(curve.xi)),
@@ -466,8 +466,3 @@ def _better(one: Certificate, other: Certificate) -> bool:
     if one.certified != other.certified:
         return one.certified
     return one.certified and one.cost < other.cost
-
-
-def _smoothing(collocation: Collocation) -> float | None:
-    value = collocation.setting.regime.smoothing
-    return None if value is None else float(value)

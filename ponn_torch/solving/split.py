@@ -28,7 +28,6 @@ from ponn_torch.solving.sharpening import graded_times, singular_interval, undec
 from ponn_torch.solving.switching import (
     Structure,
     claimed_structure,
-    extrapolated,
     find_structure,
     needles,
     without_short_arcs,
@@ -73,14 +72,13 @@ class Split(Segmentation):
         for smoothed, n_segments in self._starts(disc, start, rounds, callback):
             if rounds and rounds[-1].status.cut:
                 return Refined(smoothed, Outcome.INTERRUPTED, rounds)
-            smoothing = smoothed.collocation.setting.regime.smoothing
-            if smoothing is not None:
-                rungs.append((float(smoothing), smoothed))
-            structures = [find_structure(smoothed)]
-            if blunter is not None and smoothing is not None:
-                guessed = find_structure(smoothed, extrapolated(smoothed, blunter), polish=1)
-                # of the same arcs the curve's own times fit it better
-                structures = structures if guessed.same_arcs(structures[0]) else [guessed, *structures]
+            structures = [find_structure(smoothed, polish=0)]
+            if smoothed.smoothing:
+                rungs.append((smoothed.smoothing, smoothed))
+                if blunter is not None:
+                    guessed = find_structure(smoothed, blunter)
+                    # of the same arcs the curve's own times fit it better
+                    structures = structures if guessed.same_arcs(structures[0]) else [guessed, *structures]
             blunter = smoothed
             for structure in structures:
                 if any(structure.same_arcs(other) and n_segments == n for other, n in read):
@@ -101,14 +99,14 @@ class Split(Segmentation):
     ) -> Iterator[tuple[Curve, int]]:
         """Curves to read the arcs from, and numbers of segments: ever sharper ones, or where none is smoothed, more."""
         yield start, self.n_segments
-        smoothing, factor = start.collocation.setting.regime.smoothing, self.sharpening
+        smoothing, factor = start.smoothing, self.sharpening
         for attempt in range(self.max_sharpenings):
-            if smoothing is None:
+            if not smoothing:
                 if attempt < MORE_SEGMENTS:
                     yield start, (attempt + 2) * self.n_segments
                 continue
             sharper = factor * smoothing
-            times = graded_times(start, float(sharper), self.n_segments)
+            times = graded_times(start, sharper, self.n_segments)
             collocation = Collocation.on_segments(disc, times, setting=start.collocation.setting)
             curve, result = self.solve(collocation.with_setting(smoothing=sharper), start, callback)
             rounds.append(result)

@@ -65,7 +65,7 @@ def save_curve(curve: Curve, folder: Path) -> None:
         "knot_times": (curve.times * bvp.time_unit).tolist(),
         "events": list(collocation.events),
         "arcs": None if setting.regime.arcs is None else setting.regime.arcs.tolist(),
-        "smoothing": None if setting.regime.smoothing is None else float(setting.regime.smoothing),
+        "smoothing": curve.smoothing or None,
         "dtype": str(curve.xi.dtype).removeprefix("torch."),
     }
     given = {name: value.detach().cpu().numpy() for name, value in arrays.items() if value is not None}

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
+from functools import lru_cache, partial
 from itertools import pairwise
 
 import torch
@@ -49,52 +48,43 @@ def switching_along(curve: Curve, t: Tensor, w: Tensor | None = None) -> Tensor:
     return curve.collocation.bvp.switching(t[:, None], w, Setting(Regime(), setting.parameters))
 
 
+@lru_cache(maxsize=32)
+def _even(n_points: int, dtype: torch.dtype, device: torch.device) -> Tensor:
+    """An even grid on [−1, 1]; always the same tensor, whose tables a discretisation keeps."""
+    return torch.linspace(-1.0, 1.0, n_points, dtype=dtype, device=device)
+
+
 def grid(curve: Curve, n_points: int = 400) -> tuple[Tensor, Tensor]:
     """Scaled times and w on an even grid with both ends in every segment, (K·n,) and (K·n, 2n)."""
-    z = torch.linspace(-1.0, 1.0, n_points, dtype=curve.xi.dtype, device=curve.xi.device)
-    return curve.on_segments(z)[:2]
-
-
-def smoothing_of(curve: Curve) -> float:
-    """ρ of a curve's regime, 0 where it has none."""
-    value = curve.collocation.setting.regime.smoothing
-    return 0.0 if value is None else float(value)
+    return curve.on_segments(_even(n_points, curve.xi.dtype, curve.xi.device))[:2]
 
 
 def share_of_change(curve: Curve, blunter: Curve) -> float:
     """By how much of its change from a blunter curve a quantity that is linear in ρ changes on the way to ρ = 0."""
-    smoothing, larger = (smoothing_of(one) for one in (curve, blunter))
-    return smoothing / (larger - smoothing)
+    return curve.smoothing / (blunter.smoothing - curve.smoothing)
 
 
-def extrapolated(curve: Curve, blunter: Curve) -> Callable[[Tensor], Tensor]:
-    """S without smoothing at scaled times (m,), by Richardson's rule from two solutions of different smoothing.
+def extrapolated(curve: Curve, blunter: Curve, t: Tensor, w: Tensor) -> Tensor:
+    """S without smoothing at scaled times (m,) of a curve, by Richardson's rule from one of other smoothing.
 
     S moves with ρ nearly in proportion, and much: arcs that S(ρ) does not show yet, as it touches zero only at a
     smaller ρ, are there in what it moves towards (Earth–Mars: all five from ρ = 1 and 0.3, of which each shows three).
     """
-    share, stretch = share_of_change(curve, blunter), blunter.times[-1] / curve.times[-1]
-
-    def switching(t: Tensor) -> Tensor:
-        s = switching_along(curve, t)
-        return s + share * (s - switching_along(blunter, stretch * t))
-
-    return switching
+    s, stretch = switching_along(curve, t, w), blunter.times[-1] / curve.times[-1]
+    return s + share_of_change(curve, blunter) * (s - switching_along(blunter, stretch * t))
 
 
-def find_structure(
-    curve: Curve, switching: Callable[[Tensor], Tensor] | None = None, *, n_points: int = 1000, polish: int = 4
-) -> Structure:
-    """Zeros of S on a fine grid, polished by false position, and the arcs that S asks for.
+def find_structure(curve: Curve, blunter: Curve | None = None, *, n_points: int = 1000, polish: int = 4) -> Structure:
+    """The arcs that S asks for, and its zeros: on a fine grid, then polished by rounds of false position.
 
-    ``switching`` is S at scaled times, where it is not to be the curve's own; such a guess is hardly worth polishing.
+    Without polish S is taken for linear between the points of the grid; so it is where it is extrapolated from a
+    ``blunter`` curve.
     """
     t, w = grid(curve, max(100, n_points // curve.collocation.n_segments))
-    if switching is None:
-        s, switching = switching_along(curve, t, w), partial(switching_along, curve)
-    else:
-        s = switching(t)
-    law = curve.collocation.bvp.law
+    s = switching_along(curve, t, w) if blunter is None else extrapolated(curve, blunter, t, w)
+    switching = partial(switching_along, curve)
+    if blunter is not None or not polish:
+        switching, polish = partial(_linear, t, s), 1
     # S > 0 decides the arc, so a zero is where that changes; shared knots appear twice and change nothing
     row, event = ((s[1:] > 0) != (s[:-1] > 0)).nonzero(as_tuple=True)
     low, high, s_low, s_high = t[row], t[row + 1], s[row, event], s[row + 1, event]
@@ -112,12 +102,19 @@ def find_structure(
     root, event = root[order], event[order]
     ends = torch.cat([curve.times[:1], root, curve.times[-1:]])
     middle = 0.5 * (ends[1:] + ends[:-1])
-    arcs = law.arc_codes(switching(middle))
+    arcs = curve.collocation.bvp.law.arc_codes(switching(middle))
     keep = (arcs[1:] != arcs[:-1]).any(-1)
     arcs = torch.cat([arcs[:1], arcs[1:][keep]])
     structure = Structure(arcs, root[keep], tuple(event[keep].tolist()))
     # S = 0 at an end of the time, up to round-off of either sign, would open an arc without duration
     return without_short_arcs(structure, torch.cat([ends[:1], root[keep], ends[-1:]]), 1e-12)
+
+
+def _linear(t: Tensor, values: Tensor, at: Tensor) -> Tensor:
+    """Values (m, k) at times (m,), linear between those (n, k) at ascending times (n,), of which some come twice."""
+    after = torch.searchsorted(t, at).clamp(1, len(t) - 1)
+    share = (at - t[after - 1]) / (t[after] - t[after - 1])
+    return torch.lerp(values[after - 1], values[after], share[:, None])
 
 
 def without_short_arcs(structure: Structure, knot_times: Tensor, fraction: float) -> Structure:

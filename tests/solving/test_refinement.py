@@ -24,7 +24,7 @@ from ponn_torch.solving.refinement import Outcome, Subdivide
 from ponn_torch.solving.sharpening import legible
 from ponn_torch.solving.solution import Solution
 from ponn_torch.solving.split import Split
-from ponn_torch.solving.switching import extrapolated, find_structure
+from ponn_torch.solving.switching import find_structure
 
 OPTIMA = {"earth_mars": 396.05984393, "mars_landing": 268.0146563274}
 
@@ -69,7 +69,7 @@ def test_an_extremal_with_too_few_arcs_is_seen_by_the_sign_of_s():
 def test_two_blunt_curves_tell_the_arcs_that_neither_shows():
     sharp, blunt = smoothed("earth_mars", 0.3), smoothed("earth_mars", 1.0)
     assert len(find_structure(sharp)) == len(find_structure(blunt)) == 3
-    assert find_structure(sharp, extrapolated(sharp, blunt)).arcs.flatten().tolist() == [2, 0, 2, 0, 2]
+    assert find_structure(sharp, blunt).arcs.flatten().tolist() == [2, 0, 2, 0, 2]
     assert not legible(sharp, blunt)
 
 
