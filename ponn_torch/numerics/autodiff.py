@@ -76,9 +76,9 @@ def pointwise_jacobian(
         return value, tuple(x.movedim(0, -2) for x in pulled)
     if not count:
         return function(*arguments, *constants), tuple(x.new_zeros(n, 0, x.shape[-1]) for x in arguments)
-    fixed = [None if x is None else x.repeat(count, *[1] * (x.dim() - 1)) for x in constants]
+    fixed = [None if x is None else _repeated(x, count) for x in constants]
     with torch.enable_grad():
-        inputs = [x.detach().repeat(count, 1).requires_grad_() for x in arguments]
+        inputs = [_repeated(x.detach(), count).requires_grad_() for x in arguments]
         value = function(*inputs, *fixed)
         if not value.requires_grad:  # F does not depend on its arguments at all
             return value[:n], tuple(x.new_zeros(n, count, x.shape[-1]) for x in arguments)
@@ -86,6 +86,11 @@ def pointwise_jacobian(
         seeds[range(count), :, list(rows)] = 1.0
         pulled = torch.autograd.grad(value, inputs, seeds.view_as(value), materialize_grads=True)
     return value.detach()[:n], tuple(x.view(count, n, -1).movedim(0, 1) for x in pulled)
+
+
+def _repeated(x: Tensor, count: int) -> Tensor:
+    """x (n, ...) over and over (count · n, ...)."""
+    return x.expand(count, *x.shape).flatten(0, 1)
 
 
 def row_gradients(function: Callable[..., Tensor], *arguments: Tensor) -> tuple[Tensor, tuple[Tensor, ...]]:

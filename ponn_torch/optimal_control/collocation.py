@@ -202,11 +202,12 @@ class Collocation:
     def kappas(self, unknowns: Unknowns, h: Tensor) -> tuple[list[Tensor], list[Tensor]]:
         """Per group targets κ (..., K, d, 2q) in units of z, and the factors that made them from knot values."""
         kappas, factors = [], []
+        knots = self.discretisation.ordered(unknowns.knots)
         for group in self.discretisation.groups:
             powers = torch.arange(group.order, dtype=h.dtype, device=h.device)
             factor = group.factors * h[..., None, None] ** powers
             factors.append(torch.cat([factor, factor], -1))
-            values = unknowns.knots[..., group.columns]
+            values = group.of(knots).mT
             kappas.append(torch.cat([values[..., :-1, :, :], values[..., 1:, :, :]], -1) * factors[-1])
         return kappas, factors
 
@@ -215,10 +216,6 @@ class Collocation:
         kappas, factors = self.kappas(unknowns, h)
         return self.discretisation.expressions.jets(unknowns.weights, kappas), kappas, factors
 
-    def assemble(self, pieces: Sequence[Tensor]) -> Tensor:
-        """Columns [group, derivative, chain] (..., K, ·, n) → w (..., K, n, 2n)."""
-        return torch.cat(list(pieces), -2)[..., self.discretisation.order_of_columns, :].mT
-
     def points(self, jets: Sequence[Tensor], times: Tensor, h: Tensor) -> tuple[Tensor, Tensor]:
         """(t (..., K, n, 1), w (..., K, n, 2n)) at the nodes."""
         pieces = []
@@ -226,7 +223,7 @@ class Collocation:
             for e in range(group.order):
                 pieces.append(jet[..., e, :] / (h[..., None] ** e * group.factors[:, e])[..., None])
         t = times[..., :-1, None] + h[..., None] * (self.discretisation.nodes.points + 1.0)
-        return t.unsqueeze(-1), self.assemble(pieces)
+        return t.unsqueeze(-1), self.discretisation.assemble(pieces)
 
     def along(self, unknowns: Unknowns, t: Tensor, segment: Tensor) -> Tensor:
         """w (..., m, 2n) at scaled times (..., m), each on a given segment (..., m)."""
@@ -241,7 +238,7 @@ class Collocation:
         pieces = []
         for group, jet in zip(self.discretisation.groups, jets, strict=True):
             pieces += [jet[:, e] / (half**e * group.factors[:, e, None]) for e in range(group.order)]
-        return self.assemble(pieces).view(*t.shape, -1)
+        return self.discretisation.assemble(pieces).view(*t.shape, -1)
 
     def point_setting(self, shape: Sequence[int]) -> Setting:
         """The setting spread over points of batch × segments × nodes shape, flattened."""
@@ -266,12 +263,12 @@ class Collocation:
         Without the last factor a segment that shrinks to nothing would let y^(q−1) jump at no residual, as if by a free
         impulse.
         """
-        rows = []
+        rows, rates = [], self.discretisation.ordered(rates)
         for group, jet in zip(self.discretisation.groups, jets, strict=True):
             pointwise = jet[..., -1, :]
             if not group.trivial:
                 scale = h[..., None] ** group.order * group.factors[:, -1]
-                pointwise = pointwise - scale[..., None] * rates[..., group.columns[:, -1]].mT
+                pointwise = pointwise - scale[..., None] * group.of(rates)[..., -1, :].mT
             if group.order > 1 and len(self.free_times):
                 pointwise = pointwise / self.stretch(h)[..., None, None] ** (group.order - 1)
             tested = pointwise @ group.test.mT if group.pointwise is None else pointwise * group.pointwise
@@ -351,7 +348,7 @@ class Collocation:
 
     @cached_property
     def shared_index(self) -> Tensor:
-        """(K, S): where a segment's [left knot, right knot, anchors around it] stand among the shared unknowns."""
+        """(K, S): where a segment's [knots on both sides, group by group; anchors around it] stand among the shared."""
         k, width, device = self.n_segments, self.bvp.dimension, self.known_times.device
         n_knots, n_times = len(self.free_knots), len(self.free_times)
         knots = torch.full(((k + 1) * width,), self.n_shared, device=device)
@@ -360,7 +357,8 @@ class Collocation:
         times = torch.full((k + 1,), self.n_shared, device=device)
         times[self.free_times] = n_knots + torch.arange(n_times, device=device)
         start, end = self._segment_anchors
-        return torch.cat([knots[:-1], knots[1:], times[start, None], times[end, None]], -1)
+        sides = [torch.cat([knots[:-1, g.columns], knots[1:, g.columns]], -1) for g in self.discretisation.groups]
+        return torch.cat([*(side.flatten(1) for side in sides), times[start, None], times[end, None]], -1)
 
     @property
     def _segment_anchors(self) -> tuple[Tensor, Tensor]:

@@ -338,12 +338,13 @@ class ThrustBall(Bounded):
         primer, slope = slopes(vector, zero + low)
         square = (primer * primer).sum(-1, keepdim=True)
         some = square > 0  # where the primer vanishes no direction is better than another, and none is taken
-        norm = torch.sqrt(torch.where(some, square, 1.0)) * some
+        inverse = torch.rsqrt(torch.where(some, square, 1.0))
+        norm = square * inverse
         at_lower = self._scaled(norm - slope)
         at_upper = self._scaled(norm - slopes(vector, zero + high)[1]) if self.curved else at_lower
         fraction = _fraction(at_lower, at_upper, self.curved, self, regime)
         magnitude = low + (high - low) * fraction
-        control = self._controls(-magnitude * primer / torch.where(some, norm, 1.0), magnitude)
+        control = self._controls(-(magnitude * inverse) * primer, magnitude)
         return Minimiser(control, self._switching(at_lower, at_upper), fraction)
 
 

@@ -54,14 +54,14 @@ class Curve:
         kappas, _ = self.collocation.kappas(unknowns, half)
         jets = disc.expressions.jets_at(z, unknowns.weights[which], [kappa[which] for kappa in kappas])
         h = half[which]
-        w = self.xi.new_zeros(*h.shape, len(z), self.collocation.bvp.dimension)
-        rate = torch.zeros_like(w)
+        values, rates = [], []
         for group, jet in zip(disc.groups, jets, strict=True):
             for e in range(group.order):
                 scale = (h[..., None] ** e * group.factors[:, e])[..., None]
-                w[..., group.columns[:, e]] = (jet[..., e, :] / scale).mT
-                rate[..., group.columns[:, e]] = (jet[..., e + 1, :] / (h[..., None, None] * scale)).mT
-        return self.times[:-1][which].unsqueeze(-1) + h.unsqueeze(-1) * (z + 1.0), w, rate
+                values.append(jet[..., e, :] / scale)
+                rates.append(jet[..., e + 1, :] / (h[..., None, None] * scale))
+        t = self.times[:-1][which].unsqueeze(-1) + h.unsqueeze(-1) * (z + 1.0)
+        return t, disc.assemble(values), disc.assemble(rates)
 
     def on_segment(self, z: Tensor, segment: int) -> tuple[Tensor, Tensor, Tensor]:
         """(t (m,), w (m, 2n), ẇ (m, 2n)) at z ∈ [−1, 1] of one segment; chained entries of ẇ are exact derivatives."""

@@ -63,7 +63,8 @@ class Group:
 
     columns (d, q) of w, factors (d, q): y^(e) = factors[e] w[columns[e]]; Omega (q+1, n, 2q) is the table of the
     switching functions at the nodes; test (rows, n) makes equations from pointwise ones, pointwise (n,) is its diagonal
-    where it is one; rows locates the equations inside a segment, active among those that use F.
+    where it is one; rows locates the equations inside a segment, active among those that use F, place the columns among
+    those of all groups.
     """
 
     order: int
@@ -75,11 +76,21 @@ class Group:
     test: Tensor
     rows: slice
     active: slice
+    place: slice
     pointwise: Tensor | None
 
     @property
     def n_chains(self) -> int:
         return self.columns.shape[0]
+
+    def of(self, ordered: Tensor) -> Tensor:
+        """This group's entries (..., q, d) of w (..., 2n) in the order of the discretisation's columns: a view."""
+        return ordered[..., self.place].unflatten(-1, (self.order, -1))
+
+    @property
+    def ends(self) -> slice:
+        """Where the values at both ends stand among those of all groups, as [group, chain, end, derivative]."""
+        return slice(2 * self.place.start, 2 * self.place.stop)
 
 
 @lru_cache(maxsize=64)
@@ -119,7 +130,7 @@ class Discretisation:
         # a trivial chain is the Hermite interpolant, of degree 2q−1: y^(q) = 0 has q coefficients to be met
         test = legendre_moments(nodes, order) if trivial else self.form.matrix(nodes)
         used = 0 if trivial else len(chains)
-        rows, active = (before.rows.stop, before.active.stop) if before else (0, 0)
+        rows, active, place = (before.rows.stop, before.active.stop, before.place.stop) if before else (0, 0, 0)
         return Group(
             order=order,
             trivial=trivial,
@@ -130,6 +141,7 @@ class Discretisation:
             test=test,
             rows=slice(rows, rows + len(chains) * test.shape[0]),
             active=slice(active, active + used),
+            place=slice(place, place + order * len(chains)),
             pointwise=test.diagonal() if isinstance(self.form, Strong) and not trivial else None,
         )
 
@@ -162,10 +174,21 @@ class Discretisation:
         return self.groups[-1].rows.stop
 
     @cached_property
-    def order_of_columns(self) -> Tensor:
-        """Permutation from [group, derivative, chain] to the columns of w."""
-        columns = torch.cat([g.columns.mT.flatten() for g in self.groups])
-        return torch.argsort(columns)
+    def columns(self) -> Tensor:
+        """Columns of w in the order [group, derivative, chain]."""
+        return torch.cat([g.columns.mT.flatten() for g in self.groups])
+
+    @cached_property
+    def _back(self) -> Tensor:
+        return torch.argsort(self.columns)
+
+    def ordered(self, w: Tensor) -> Tensor:
+        """w (..., 2n) in the order of ``columns``, in which every group's are a slice."""
+        return w.index_select(-1, self.columns)
+
+    def assemble(self, pieces: Sequence[Tensor]) -> Tensor:
+        """Rows [group, derivative, chain] (..., ·, n) → w (..., n, 2n)."""
+        return torch.cat(list(pieces), -2).index_select(-2, self._back).mT
 
     @cached_property
     def last_columns(self) -> Tensor:

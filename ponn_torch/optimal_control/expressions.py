@@ -173,17 +173,8 @@ class LinearExpressions:
         n_rows = self.groups[-1].rows.stop
         local = weights.new_zeros(*weights.shape[:-1], n_rows, self.n_own)
         for (i, j), by_order in cotangents.items():
-            group, table = self.groups[i], self.tables[j]
-            shape = (group.n_chains, -1, self.groups[j].n_chains, table.size)
-            block = local[..., group.rows, table.own].unflatten(-1, shape[2:]).unflatten(-3, shape[:2])
-            for e, c in by_order.items():
-                if group.pointwise is not None:
-                    block.addcmul_(c.unsqueeze(-1), table.B[e].unsqueeze(-2))
-                else:
-                    product = group.test @ (c.unsqueeze(-1) * table.B[e].unsqueeze(-2)).flatten(-2)
-                    block.add_(product.unflatten(-1, shape[2:]))
-            if i == j:
-                block.diagonal(dim1=-4, dim2=-2).add_((group.test @ table.B[-1]).unsqueeze(-1))
+            columns = local[..., self.tables[j].own].unflatten(-1, (self.groups[j].n_chains, -1))
+            accumulate(columns, self.groups[i], by_order, self.tables[j].B, own=i == j)
         return local
 
     def fit(self, values: Sequence[Tensor], kappas: Sequence[Tensor]) -> Tensor:
@@ -192,6 +183,23 @@ class LinearExpressions:
             if not group.trivial:
                 self.beta(i, weights).copy_(self.tables[i].made.fit(values[i], kappas[i].mT).mT)
         return weights
+
+
+def accumulate(columns: Tensor, group: Group, by_order: Mapping[int, Tensor], table: Tensor, own: bool) -> Tensor:
+    """Add a group's equations' derivatives to columns (..., rows of a segment, d', L), by the table (q+1, n, L) of y.
+
+    own: the columns are the group's own, so that its highest derivative counts too. What was written to is returned.
+    """
+    block = columns[..., group.rows, :, :].unflatten(-3, (group.n_chains, -1))
+    for e, c in by_order.items():
+        if group.pointwise is not None:
+            block.addcmul_(c.unsqueeze(-1), table[e].unsqueeze(-2))
+        else:
+            product = group.test @ (c.unsqueeze(-1) * table[e].unsqueeze(-2)).flatten(-2)
+            block.add_(product.unflatten(-1, block.shape[-2:]))
+    if own:
+        block.diagonal(dim1=-4, dim2=-2).add_((group.test @ table[-1]).unsqueeze(-1))
+    return block
 
 
 def _made(

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from ponn_torch.numerics.linalg import ArrowJacobian
 from ponn_torch.optimal_control.discretisation import Discretisation
-from ponn_torch.optimal_control.expressions import Cotangents
+from ponn_torch.optimal_control.expressions import Cotangents, accumulate
 
 if TYPE_CHECKING:
     from ponn_torch.optimal_control.collocation import Collocation
@@ -60,11 +60,16 @@ def _weigh(collocation: Collocation, equations: Tensor, h: Tensor, local: Tensor
 
 
 def _rates_and_slopes(collocation: Collocation, t: Tensor, w: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """F (..., 2n) at the nodes and, for the equations in use, ∂F/∂t (..., rows) and ∂F/∂w (..., rows, 2n)."""
-    shape, rows = w.shape, collocation.discretisation.last_columns.tolist()
+    """F (..., 2n) at the nodes and, for the equations in use, ∂F/∂t (..., rows) and ∂F/∂w (..., rows, 2n).
+
+    The columns of ∂F/∂w are in the order of the discretisation's.
+    """
+    shape, disc = w.shape, collocation.discretisation
+    rows = disc.last_columns.tolist()
     points = t.reshape(-1, 1), w.reshape(-1, shape[-1])
     rates, by_t, by_w = collocation.bvp.linearised_rates(*points, collocation.point_setting(shape[:-1]), rows)
-    return rates.view(shape), by_t.view(*shape[:-1], len(rows)), by_w.view(*shape[:-1], len(rows), shape[-1])
+    by_w = disc.ordered(by_w).view(*shape[:-1], len(rows), shape[-1])
+    return rates.view(shape), by_t.view(*shape[:-1], len(rows)), by_w
 
 
 def _by_half_length(
@@ -78,7 +83,7 @@ def _by_half_length(
 ) -> list[Tensor]:
     """Derivative of each group's pointwise equations (..., K, d, n) with respect to h at fixed β and knots."""
     disc, per_length = collocation.discretisation, 1.0 / h[..., None, None]
-    moved, tops = [], []
+    moved, tops, rates = [], [], disc.ordered(rates)
     for group, jet, kappa in zip(disc.groups, jets, kappas, strict=True):
         powers = torch.arange(group.order, dtype=h.dtype, device=h.device).repeat(2)
         # κ_e carries h^e
@@ -87,13 +92,13 @@ def _by_half_length(
             scale = (h[..., None] ** e * group.factors[:, e])[..., None]
             moved.append((by_h[..., e, :] - e * per_length * jet[..., e, :]) / scale)
         tops.append(by_h[..., -1, :])
-    by_points = (by_w @ collocation.assemble(moved).unsqueeze(-1)).squeeze(-1)
+    by_points = (by_w @ torch.cat(moved, -2).mT.unsqueeze(-1)).squeeze(-1)
     total = by_points + by_t * (disc.nodes.points + 1.0)[:, None]
     out = []
     for group, top in zip(disc.groups, tops, strict=True):
         if not group.trivial:
             scale = h[..., None] ** group.order * group.factors[:, -1]
-            growth = group.order * per_length * rates[..., group.columns[:, -1]].mT
+            growth = group.order * per_length * group.of(rates)[..., -1, :].mT
             top = top - scale[..., None] * (growth + total[..., group.active].mT)
         out.append(top)
     return out
@@ -116,14 +121,14 @@ def _cotangents(disc: Discretisation, h: Tensor, by_w: Tensor) -> Cotangents:
     """∂(pointwise equations)/∂(derivatives of the chains); a group's equations are y^(q) − scale F."""
     out: dict[tuple[int, int], dict[int, Tensor]] = {}
     for i, group in enumerate(disc.groups):
-        scale = h[..., None] ** group.order * group.factors[:, -1]
         by_group = by_w[..., group.active, :]
         for j, other in enumerate(disc.groups):
             by_order = out[i, j] = {}
             for e in disc.active_orders(group, other):
-                ratio = -scale[..., :, None] / (h[..., None] ** e * other.factors[:, e])[..., None, :]
+                factors = -group.factors[:, -1, None] / other.factors[:, e]
+                ratio = h[..., None, None, None] ** (group.order - e) * factors
                 # (..., K, d, n, d'): equation, node, chain that it depends on
-                c = (by_group[..., other.columns[:, e]] * ratio[..., None, :, :]).transpose(-3, -2)
+                c = (other.of(by_group)[..., e, :] * ratio).transpose(-3, -2)
                 by_order[e] = c if group.pointwise is None else c * group.pointwise[:, None]
     return out
 
@@ -131,20 +136,8 @@ def _cotangents(disc: Discretisation, h: Tensor, by_w: Tensor) -> Cotangents:
 def _by_knots(disc: Discretisation, cotangents: Cotangents, kappa_factors: Sequence[Tensor], shared: Tensor) -> None:
     """Fill the knots' columns of ``shared``: y sees them through Ω κ."""
     for (i, j), by_order in cotangents.items():
-        if not by_order and i != j:
-            continue
-        group, other = disc.groups[i], disc.groups[j]
-        by_kappa = shared.new_zeros(
-            *shared.shape[:-2], group.n_chains, len(group.test), other.n_chains, 2 * other.order
-        )
-        for e, c in by_order.items():
-            if group.pointwise is not None:
-                by_kappa.addcmul_(c.unsqueeze(-1), other.Omega[e].unsqueeze(-2))
-            else:
-                product = group.test @ (c.unsqueeze(-1) * other.Omega[e].unsqueeze(-2)).flatten(-2)
-                by_kappa.add_(product.unflatten(-1, (other.n_chains, -1)))
-        if i == j:
-            by_kappa.diagonal(dim1=-4, dim2=-2).add_((group.test @ group.Omega[-1]).unsqueeze(-1))
-        index = torch.cat([other.columns, other.columns + disc.bvp.dimension], -1).flatten()
-        block = by_kappa * kappa_factors[j][..., None, None, :, :]
-        shared[..., group.rows, index] = block.flatten(-4, -3).flatten(-2)
+        if by_order or i == j:
+            other = disc.groups[j]
+            columns = shared[..., other.ends].unflatten(-1, (other.n_chains, -1))
+            block = accumulate(columns, disc.groups[i], by_order, other.Omega, own=i == j)
+            block.mul_(kappa_factors[j][..., None, None, :, :])

@@ -84,29 +84,45 @@ class BoundaryValueProblem:
         return self.problem.time_guess / self.time_unit
 
     @cached_property
-    def _curved(self) -> Tensor:
-        return self.exponent != 0
+    def _slope(self) -> Tensor:
+        """ψ' where y = 0."""
+        return self.unit * torch.where(self.exponent != 0, self.exponent, 1.0)
+
+    @cached_property
+    def _costate_unit(self) -> Tensor:
+        """λ/μ where y = 0."""
+        return self.conjugate / self._slope
+
+    @cached_property
+    def _rate_units(self) -> tuple[Tensor, Tensor]:
+        """ẏ/ẋ where y = 0, and μ̇/(∂H/∂y)."""
+        return self.time_unit / self._slope, -self.time_unit / self.conjugate
+
+    @cached_property
+    def _straight(self) -> tuple[Tensor, Tensor]:
+        """(a, b): ψ = e^{exponent y} (a + b y)."""
+        curved = self.exponent != 0
+        return torch.where(curved, self.unit, 0.0), torch.where(curved, 0.0, self.unit)
 
     def _psi(self, y: Tensor) -> tuple[Tensor, Tensor]:
-        """ψ(y) and ψ'(y)."""
+        """ψ(y) and ψ'(0)/ψ'(y) = e^{−exponent y}: without a division or a mask, whose derivatives cost the most."""
         if self.mass_variable == "mass":
-            return self.unit * y, self.unit.expand_as(y)
-        curved, exponential = self._curved, torch.exp(self.exponent * y)  # 1 where the exponent is 0
-        scale = self.unit * torch.where(curved, exponential, 1.0)
-        return torch.where(curved, scale, self.unit * y), torch.where(curved, self.exponent * scale, scale)
+            return self.unit * y, torch.ones_like(y)
+        at_zero, growth = self._straight
+        return torch.exp(self.exponent * y) * torch.addcmul(at_zero, growth, y), torch.exp(-self.exponent * y)
 
     def to_physical(self, w: Tensor) -> tuple[Tensor, Tensor]:
         """States and costates in the user's units from w (..., 2n)."""
-        y, mu = w[..., : self.n_states], w[..., self.n_states :]
-        x, slope = self._psi(y)
-        return x, self.conjugate * mu / slope
+        y, mu = w.split(self.n_states, -1)
+        x, shrink = self._psi(y)
+        return x, self._costate_unit * shrink * mu
 
     def to_scaled(self, x: Tensor, costates: Tensor) -> Tensor:
         """Inverse of ``to_physical``."""
         curved = self.exponent != 0
         ratio = torch.where(curved, x / self.unit, torch.ones_like(x))
         y = torch.where(curved, self.exponent * torch.log(ratio), x / self.unit)
-        return torch.cat([y, costates * self._psi(y)[1] / self.conjugate], -1)
+        return torch.cat([y, costates / (self._costate_unit * self._psi(y)[1])], -1)
 
     def _parameters(self, setting: Setting) -> Named:
         """The problem's parameters, those of the setting where it gives them."""
@@ -137,18 +153,19 @@ class BoundaryValueProblem:
 
     def rates(self, t: Tensor, w: Tensor, setting: Setting) -> Tensor:
         """F(t, w): scaled rates (..., 2n) of states and costates."""
-        n = self.n_states
         u = Named(**self.minimiser(t, w, setting).control)
-        p, time, mu = self._parameters(setting), t * self.time_unit, w[..., n:]
+        p, time = self._parameters(setting), t * self.time_unit
 
         def h(y: Tensor) -> tuple[Tensor, tuple[Tensor, Tensor]]:
-            x, slope = self._psi(y)
-            value, rates = self._hamiltonian(time, x, self.conjugate * mu / slope, u, p)
-            return value, (rates, slope)
+            x, shrink = self._psi(y)
+            value, rates = self._hamiltonian(time, x, self._costate_unit * shrink * mu, u, p)
+            return value, (rates, shrink)
 
         with differentiable(t, w, *setting.parameters.values()):
-            (gradient,), (rates, slope) = gradients_and_values(h, w[..., :n])
-        return self.time_unit * torch.cat([rates / slope, -gradient / self.conjugate], -1)
+            y, mu = w.split(self.n_states, -1)
+            (gradient,), (rates, shrink) = gradients_and_values(h, y)
+        by_state, by_gradient = self._rate_units
+        return torch.cat([by_state * shrink * rates, by_gradient * gradient], -1)
 
     def linearised_rates(
         self, t: Tensor, w: Tensor, setting: Setting, rows: Sequence[int]
@@ -237,7 +254,7 @@ class BoundaryValueProblem:
             (phi_t, phi_x), (psi,) = gradients_and_values(end_function, time, x)
         if self.terminal_components:
             index = self.terminal_components
-            unit = (self.conjugate / self._psi(w[..., : self.n_states])[1])[..., index]
+            unit = (self._costate_unit * self._psi(w[..., : self.n_states])[1])[..., index]
             rows.append((costates[..., index] - phi_x[..., index]) / unit)
         if self.n_multipliers:
             rows.append(psi)

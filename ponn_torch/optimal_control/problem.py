@@ -156,7 +156,7 @@ class OptimalControlProblem:
 
     def named(self, x: Tensor) -> Named:
         """View a state vector (..., n_states) by the names of its blocks."""
-        return Named(**{name: x[..., s] for name, s in self.slices.items()})
+        return Named(**dict(zip(self.states, x.split(list(self.states.values()), -1), strict=True)))
 
     def stack(self, blocks: Mapping[str, Tensor], like: Tensor) -> Tensor:
         """Inverse of ``named`` for rates: blocks broadcast against ``like`` (..., n_states)."""
