@@ -7,10 +7,9 @@ Riccati sweep where a horizon is expanded around the reference once, solve_bvp o
 
 from __future__ import annotations
 
-import statistics
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
-from typing import Any
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
 
 import torch
 from torch import Tensor
@@ -21,6 +20,7 @@ from ponn_torch.guidance.expansion import expand
 from ponn_torch.guidance.oracles import exponential_gain, nonlinear_control, riccati_sweep
 from ponn_torch.guidance.producers import Passes, Planner
 from ponn_torch.guidance.tracking import Setpoint, TrackingProblem
+from ponn_torch.guidance.verdict import FlightCertificate, spread_evenly
 
 Oracle = Callable[[Planner, list[float], list[float], Tensor], Tensor]  # starts, durations, x (S, n) -> u (S, m)
 STEPS = 600  # of the sweep: its error is then below 1e-9 of the gain for horizons with fast modes at rate 30/horizon
@@ -91,7 +91,7 @@ def oracle_of(planner: Planner) -> str:
     """The name in ORACLES of what answers the question that the planner asks."""
     if planner.problem.plant.linear and isinstance(planner.problem.reference, Setpoint):
         return "matrix exponential"
-    return "Riccati sweep" if planner.passes.most == 1 or planner.problem.plant.linear else "solve_bvp"
+    return "Riccati sweep" if planner.affine else "solve_bvp"
 
 
 # -- certificate -------------------------------------------------------------------------------------
@@ -117,13 +117,13 @@ class Allowed:
 
 
 @dataclass(frozen=True)
-class GuidanceCertificate:
+class GuidanceCertificate(FlightCertificate):
     """What was found when a flight's decisions were made again; lists are per checked cycle.
 
-    control_errors: ‖u0 − oracle‖/‖oracle‖. iteration_errors: the same against Newton's method on the same nodes, from
-    the reference to the end; where one pass is all that is asked for, against that pass made again. off_node_residuals,
-    losses: of the same horizons. final_errors: |state − reference| at the end, in the units that people read. peaks:
-    largest value of each of the plant's limits.
+    iteration_errors: as control_errors, but against Newton's method on the same nodes, from the reference to the end;
+    where one pass is all that is asked for, against that pass made again. off_node_residuals, losses: of the same
+    horizons. final_errors: |state − reference| at the end, in the units that people read. peaks: largest value of each
+    of the plant's limits.
     """
 
     oracle: str
@@ -140,48 +140,33 @@ class GuidanceCertificate:
     allowed: Allowed = Allowed()
     completed: bool = True
 
+    told = (*FlightCertificate.told, "largest_iteration_error")
+
     @property
     def largest_iteration_error(self) -> float:
-        return max(self.iteration_errors, default=float("nan"))
+        return max(self.iteration_errors, default=math.nan)
 
     @property
-    def largest_error(self) -> float:
-        return max(self.control_errors, default=float("nan"))
+    def claim(self) -> str:
+        return f"every checked control is within {self.allowed.oracle:g} of the {self.oracle}'s"
 
     @property
-    def median_error(self) -> float:
-        return statistics.median(self.control_errors) if self.control_errors else float("nan")
+    def checks(self) -> list[tuple[bool, str]]:
+        limit = self.allowed
+
+        def control(found: float, allowed: float, whose: str) -> tuple[bool, str]:
+            return found <= allowed, f"a control is {found:.2g} off {whose}; allowed: {allowed:g}"
+
+        return [
+            (self.completed, "the flight was interrupted"),
+            (bool(self.control_errors), "no decision was checked"),
+            control(self.largest_error, limit.oracle, f"the {self.oracle}'s"),
+            control(self.largest_iteration_error, limit.iteration, "the limit of its passes"),
+        ]
 
     @property
-    def certified(self) -> bool:
-        """Flown to the end, and every checked decision within what is allowed of the oracle's and of its own limit."""
-        return (
-            self.completed
-            and bool(self.control_errors)
-            and self.largest_error <= self.allowed.oracle
-            and self.largest_iteration_error <= self.allowed.iteration
-        )
-
-    @property
-    def verdict(self) -> str:
-        if not self.completed:
-            return "not certified: the flight was interrupted"
-        if not self.control_errors:
-            return "not certified: no decision was checked"
-        if self.certified:
-            return f"certified: every checked control is within {self.allowed.oracle:g} of the {self.oracle}'s"
-        if not self.largest_error <= self.allowed.oracle:
-            found, limit, what = self.largest_error, self.allowed.oracle, f"the {self.oracle}'s"
-        else:
-            found, limit, what = self.largest_iteration_error, self.allowed.iteration, "the limit of its passes"
-        return f"not certified: a control is {found:.2g} off {what}; allowed: {limit:g}"
-
-    def to_dict(self) -> dict[str, Any]:
-        told = ("certified", "verdict", "largest_error", "median_error", "largest_iteration_error")
-        return asdict(self) | {name: getattr(self, name) for name in told}
-
-    def to_text(self) -> str:
-        rows = [
+    def rows(self) -> list[tuple[str, str, str]]:
+        return [
             ("control at the start against the oracle, median", f"{self.median_error:.2e}", ""),
             ("largest", f"{self.largest_error:.2e}", f"{self.allowed.oracle:.1e}"),
             (
@@ -189,15 +174,12 @@ class GuidanceCertificate:
                 f"{self.largest_iteration_error:.2e}",
                 f"{self.allowed.iteration:.1e}",
             ),
-            ("residual between the nodes, largest", f"{max(self.off_node_residuals, default=float('nan')):.2e}", ""),
-            ("loss at the nodes, largest", f"{max(self.losses, default=float('nan')):.2e}", ""),
+            ("residual between the nodes, largest", f"{max(self.off_node_residuals, default=math.nan):.2e}", ""),
+            ("loss at the nodes, largest", f"{max(self.losses, default=math.nan):.2e}", ""),
             ("decisions replaced (late or not finite)", f"{self.n_late} of {self.n_cycles}", ""),
             ("cycles with a saturated control", f"{100 * self.saturated:.1f} %", ""),
             *((f"largest {name}, over its limit", f"{peak:.5f}", "") for name, peak in self.peaks.items()),
         ]
-        head = f"check ({len(self.cycles)} cycles)"
-        lines = [self.verdict, "", f"{head:52}{'measured':>12}{'allowed':>12}"]
-        return "\n".join([*lines, *(f"{name:52}{measured:>12}{limit:>12}".rstrip() for name, measured, limit in rows)])
 
 
 def certify(
@@ -206,7 +188,7 @@ def certify(
     """Check decisions evenly spread over the flight of one vehicle, those replaced by a fallback left out."""
     plant = flight.problem.plant
     candidates = [k for k in range(flight.n_cycles) if not bool(flight.late[k])]
-    cycles = sorted({candidates[round(i)] for i in spread_evenly(len(candidates), n_samples)})
+    cycles = spread_evenly(candidates, n_samples)
     allowed, converged = allowed or Allowed(), _to_the_end(planner)
     errors: list[float] = []
     iteration: list[float] = []
@@ -245,7 +227,7 @@ def certify(
 
 def _to_the_end(planner: Planner) -> Planner:
     """What a planner's passes go towards: Newton's method to 1e-11 of the states' size; one pass is its own end."""
-    if planner.passes.most == 1 or planner.problem.plant.linear:
+    if planner.affine:
         return planner
     size = float(planner.problem.initial.norm().clamp_min(1.0))
     return replace(planner, passes=Passes(40, 1e-11 * size, second_order=True), traced=False)
@@ -255,9 +237,3 @@ def _relative(found: Tensor, truth: Tensor) -> list[float]:
     """‖found − truth‖/‖truth‖ of (S, m), infinite where it is not a number."""
     difference = torch.linalg.vector_norm(found - truth, dim=-1) / torch.linalg.vector_norm(truth, dim=-1)
     return [value if value == value else float("inf") for value in difference.tolist()]
-
-
-def spread_evenly(count: int, wanted: int) -> Sequence[float]:
-    """At most so many of 0 … count − 1, both ends among them."""
-    wanted = min(count, wanted)
-    return [i * (count - 1) / max(wanted - 1, 1) for i in range(wanted)]

@@ -145,7 +145,7 @@ def gain_schedule(planner: Planner, table: Timetable, *, with_loss: bool = True)
     Raises ValueError where planning takes several passes and the plant is not linear: no gain is then exact.
     """
     problem = planner.problem
-    if planner.passes.most > 1 and not problem.plant.linear:
+    if not planner.affine:
         raise ValueError(
             f"most = {planner.passes.most} with a gain schedule of {problem.plant.name}, which is not linear; "
             "allowed: 1"

@@ -92,6 +92,11 @@ class Planner:
     traced: bool = False
     _tables: dict[tuple[torch.Size, bool], Callable[..., Tensor]] = field(default_factory=dict, init=False, repr=False)
 
+    @property
+    def affine(self) -> bool:
+        """Whether plans are affine in the state that they start from: one pass, or a linear plant."""
+        return self.passes.most == 1 or self.problem.plant.linear
+
     def expand(self, t: Tensor, x: Tensor, u: Tensor, costates: Tensor) -> Expansion:
         """Around a guess; by a trace of the derivatives where that was asked for."""
         second = self.passes.second_order

@@ -7,15 +7,13 @@ from the same measured state. The two share the state only.
 from __future__ import annotations
 
 import math
-import statistics
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
-from typing import Any
+from dataclasses import dataclass
 
 import torch
 
-from ponn_torch.guidance.accuracy import spread_evenly
 from ponn_torch.guidance.descent import Landing, PoweredDescent
+from ponn_torch.guidance.verdict import FlightCertificate, spread_evenly
 from ponn_torch.optimal_control.problem import FreeTime, OptimalControlProblem
 from ponn_torch.solving.solver import Solver
 
@@ -36,12 +34,12 @@ class Limits:
 
 
 @dataclass(frozen=True)
-class LandingCertificate:
+class LandingCertificate(FlightCertificate):
     """What a landing was measured to be; lists are per checked cycle.
 
     miss, impact: of the nominal lander. n_landed of n_landers: of the fleet, with its largest_miss, largest_impact; 0
-    of 0 without one. control_errors: ‖command − oracle‖/‖oracle‖. planned_fuel, optimal_fuel: kg of the undisturbed
-    plan, and of the optimum with the engines' whole thrust. peak_thrust: largest command over the engines' maximum.
+    of 0 without one. planned_fuel, optimal_fuel: kg of the undisturbed plan, and of the optimum with the engines' whole
+    thrust. peak_thrust: largest command over the engines' maximum.
     """
 
     miss: float
@@ -62,13 +60,8 @@ class LandingCertificate:
     allowed: Limits
     completed: bool = True
 
-    @property
-    def largest_error(self) -> float:
-        return max(self.control_errors, default=math.nan)
-
-    @property
-    def median_error(self) -> float:
-        return statistics.median(self.control_errors) if self.control_errors else math.nan
+    decisions = "plans"
+    told = (*FlightCertificate.told, "share")
 
     @property
     def share(self) -> float:
@@ -76,9 +69,14 @@ class LandingCertificate:
         return self.n_landed / self.n_landers if self.n_landers else 1.0
 
     @property
-    def _failures(self) -> list[str]:
+    def claim(self) -> str:
+        fleet = f", {self.n_landed} of {self.n_landers} dispersed ones" if self.n_landers else ""
+        return f"the lander{fleet} within {self.allowed.miss:g} m and {self.allowed.impact:g} m/s"
+
+    @property
+    def checks(self) -> list[tuple[bool, str]]:
         limit = self.allowed
-        checks = (
+        return [
             (self.completed, "the flight was interrupted"),
             (self.miss <= limit.miss, f"{self.miss:.2g} m off the target; allowed: {limit.miss:g}"),
             (self.impact <= limit.impact, f"{self.impact:.2g} m/s at the target; allowed: {limit.impact:g}"),
@@ -88,30 +86,14 @@ class LandingCertificate:
             ),
             (bool(self.control_errors), "no plan was checked"),
             (
-                not self.control_errors or self.largest_error <= limit.control_error,
+                self.largest_error <= limit.control_error,
                 f"a command is {self.largest_error:.2g} off the {ORACLE}'s; allowed: {limit.control_error:g}",
             ),
             (self.peak_thrust <= 1 + 1e-9, f"the thrust is {self.peak_thrust:.6f} of the engines' maximum"),
-        )
-        return [text for good, text in checks if not good]
+        ]
 
     @property
-    def certified(self) -> bool:
-        """Flown to the end, landed, as many of the fleet as asked for, and every checked plan the oracle's."""
-        return not self._failures
-
-    @property
-    def verdict(self) -> str:
-        if self._failures:
-            return f"not certified: {self._failures[0]}"
-        fleet = f", {self.n_landed} of {self.n_landers} dispersed ones" if self.n_landers else ""
-        return f"certified: the lander{fleet} within {self.allowed.miss:g} m and {self.allowed.impact:g} m/s"
-
-    def to_dict(self) -> dict[str, Any]:
-        told = ("certified", "verdict", "largest_error", "median_error", "share")
-        return asdict(self) | {name: getattr(self, name) for name in told}
-
-    def to_text(self) -> str:
+    def rows(self) -> list[tuple[str, str, str]]:
         limit = self.allowed
         rows = [
             ("distance from the target, m", f"{self.miss:.2e}", f"{limit.miss:.1e}"),
@@ -133,8 +115,7 @@ class LandingCertificate:
                 ("largest distance of the fleet, m", f"{self.largest_miss:.2e}", ""),
                 ("largest speed of the fleet, m/s", f"{self.largest_impact:.2e}", ""),
             ]
-        lines = [self.verdict, "", f"{f'check ({len(self.cycles)} plans)':52}{'measured':>12}{'allowed':>12}"]
-        return "\n".join([*lines, *(f"{name:52}{found:>12}{bound:>12}".rstrip() for name, found, bound in rows)])
+        return rows
 
 
 def landed(flight: Landing, limits: Limits) -> torch.Tensor:
@@ -157,7 +138,7 @@ def certify_landing(
     """
     allowed = allowed or Limits()
     candidates = flight.planned[:, 0].nonzero()[:, 0].tolist()
-    cycles = sorted({candidates[round(i)] for i in spread_evenly(len(candidates), n_samples)})
+    cycles = spread_evenly(candidates, n_samples)
     errors = [_off(flight, k, solver or Solver()) for k in cycles]
     high = flight.problem.thrust_bounds[1]
     down = flight.states.new_zeros(0) if fleet is None else fleet.miss

@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 
 from ponn_torch.guidance.closed_loop import Flight
 from ponn_torch.guidance.descent import Landing
-from ponn_torch.reporting.flights import Judged
+from ponn_torch.guidance.verdict import FlightCertificate
 from ponn_torch.reporting.report import (
     CERTIFICATE,
     FIGURES,
@@ -39,7 +39,7 @@ def write_flight_report(
     folder: Path,
     *,
     title: str,
-    certificate: Judged | None = None,
+    certificate: FlightCertificate | None = None,
     sections: Sequence[str] = (),
     draw: Callable[[], Mapping[str, Figure]] | None = None,
     settings: Mapping[str, Any] | None = None,

@@ -5,26 +5,13 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 from types import TracebackType
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
+from ponn_torch.guidance.verdict import FlightCertificate
 from ponn_torch.reporting.records import RECORDS, JsonLines
 
 if TYPE_CHECKING:
     from typing import Self
-
-
-class Judged(Protocol):
-    """What a flight was found to be worth: a certificate of any kind of flight."""
-
-    @property
-    def certified(self) -> bool: ...
-
-    @property
-    def verdict(self) -> str: ...
-
-    def to_dict(self) -> dict[str, Any]: ...
-
-    def to_text(self) -> str: ...
 
 
 class FlightRecorder:
@@ -69,7 +56,7 @@ class FlightRecorder:
                 flush=True,
             )
 
-    def certificate(self, certificate: Judged) -> None:
+    def certificate(self, certificate: FlightCertificate) -> None:
         self._lines.write("certificate", **certificate.to_dict())
         if self._events is not None:
             told = {key: value for key, value in certificate.to_dict().items() if not isinstance(value, list)}
