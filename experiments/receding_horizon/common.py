@@ -23,12 +23,6 @@ def chebyshev(n_nodes: int = 10, route: str = "lu") -> HorizonSolver:
     return HorizonSolver(Chebyshev(n_nodes, 1), make_nodes("legendre_lobatto", n_nodes), route=route)
 
 
-def running_cost(flight: Flight) -> float:
-    """Summed over cycles, as the paper does."""
-    problem = flight.problem
-    return float(problem.running_cost(flight.times[:-1], flight.states[:-1], flight.controls).sum() * problem.cycle)
-
-
 def in_units(values: Tensor, problem: TrackingProblem, what: str = "states") -> Tensor:
     """Values (..., components) in the units that people read."""
     return values / values.new_tensor([unit.size for unit in getattr(problem.plant, what).values()])

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from experiments.receding_horizon.common import RESULTS, Watched, chebyshev, flown, running_cost
+from experiments.receding_horizon.common import RESULTS, Watched, chebyshev, flown
 from experiments.tables import Report, markdown
 from ponn_torch.guidance.closed_loop import Flight
 from ponn_torch.guidance.plants.quadrotor import quadrotor
@@ -53,7 +53,7 @@ def run_costs() -> Report:
         problem = displaced(x)
         for name, passes in ways.items():
             flight, _, seconds = flown(problem, chebyshev(), passes, "stop")
-            cost, first = running_cost(flight), flight.controls[0]
+            cost, first = float(flight.cost), flight.controls[0]
             counts = flight.passes.double()
             rows.append(
                 {

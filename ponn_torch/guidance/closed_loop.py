@@ -86,10 +86,21 @@ class Flight:
         return int(self.late.sum())
 
     @property
+    def _times(self) -> Tensor:
+        """(C + 1, ...) that broadcast to the vehicles."""
+        return self.times.view(-1, *[1] * (self.states.dim() - 2))
+
+    @property
     def errors(self) -> Tensor:
         """States less reference, (C + 1, ..., n)."""
-        states, _ = self.problem.reference(self.times)
-        return self.states - states.view(len(self.times), *[1] * (self.states.dim() - 2), -1)
+        states, _ = self.problem.reference(self._times)
+        return self.states - states
+
+    @property
+    def cost(self) -> Tensor:
+        """(...,): the running cost summed over the cycles by the rectangle rule, as the papers do."""
+        running = self.problem.running_cost(self._times[:-1], self.states[:-1], self.controls)
+        return running.sum(0) * self.problem.cycle
 
     @property
     def saturated(self) -> Tensor:

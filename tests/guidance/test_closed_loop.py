@@ -9,19 +9,13 @@ from helpers import relative
 from test_expansion import PROBLEMS, solver
 from torch import Tensor
 
-from ponn_torch.guidance.closed_loop import Flight, Loop, fly
+from ponn_torch.guidance.closed_loop import Loop, fly
 from ponn_torch.guidance.controllers import Decision, HorizonController, Timetable, gain_schedule, timetable
 from ponn_torch.guidance.plants.clohessy_wiltshire import clohessy_wiltshire
 from ponn_torch.guidance.plants.quadrotor import quadrotor
 from ponn_torch.guidance.plants.shuttle import shuttle
 from ponn_torch.guidance.producers import Passes, Planner
 from ponn_torch.guidance.tracking import PiecewiseReference, Plant, Setpoint, TrackingProblem
-
-
-def cost(flight: Flight) -> float:
-    """Of what was flown, by the rectangle rule of the cycles, as the papers sum it."""
-    problem = flight.problem
-    return float(problem.running_cost(flight.times[:-1], flight.states[:-1], flight.controls).sum() * problem.cycle)
 
 
 def short(table: Timetable, count: int) -> Timetable:
@@ -38,7 +32,7 @@ def test_rendezvous_numbers(horizon: float, distance: float, expected: float, fi
     flight = fly(problem, gain_schedule(Planner(problem, solver(), Passes(1)), table), table, problem.initial)
     unit = problem.plant.states["r1"].size, problem.plant.controls["a1"].size
     assert float(flight.states[-1, :3].norm()) / unit[0] == pytest.approx(distance, rel=5e-4)
-    assert cost(flight) == pytest.approx(expected, rel=1e-6)
+    assert float(flight.cost) == pytest.approx(expected, rel=1e-6)
     assert (flight.controls[0] / unit[1]).tolist() == pytest.approx(first, abs=1e-6)
     assert flight.loss.max() < 1e-13
 
@@ -49,7 +43,7 @@ def test_quadrotor_costs() -> None:
     assert len(table.starts) == 290
     schedule = gain_schedule(Planner(problem, solver(), Passes(1)), table)
     flight = fly(problem, schedule, table, problem.initial)
-    assert cost(flight) == pytest.approx(32323.233, abs=2e-3)
+    assert float(flight.cost) == pytest.approx(32323.233, abs=2e-3)
     assert not flight.late.any()
     assert flight.saturated == 0.0
 
@@ -73,6 +67,7 @@ def test_vehicles_fly_together_as_alone() -> None:
     alone = fly(problem, HorizonController(planner, table), table, starts[2])
     assert together.states.shape == (31, 4, 3)
     assert relative(together.states[:, 2], alone.states) < 1e-12
+    assert relative(together.cost[2], alone.cost) < 1e-12
     assert together.limits()["heat rate"].shape == (30, 4)
     within = (starts - problem.reference(starts.new_zeros(()))[0]).abs() <= problem.dispersion
     assert bool(within.all())
