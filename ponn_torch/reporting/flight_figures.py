@@ -85,18 +85,21 @@ def accuracy_figure(flight: Flight, certificate: GuidanceCertificate) -> Figure:
 
 
 @house_style
-def timing_figure(flight: Flight, deadline: float | None = None) -> Figure:
-    """How long decisions took, with the deadline and the cycle."""
+def timing_figure(
+    seconds: torch.Tensor, deadline: float | None, *, what: str, counted: str, title: str, bins: int
+) -> Figure:
+    """How long decisions, or plans, took, with the median and the deadline."""
     figure = Figure(figsize=(7.0, 2.8), layout="constrained")
     ax = figure.subplots()
-    milliseconds = 1e3 * flight.seconds.numpy()
-    ax.hist(milliseconds, bins=60, color=GREEN, alpha=0.85)
-    ax.axvline(float(flight.seconds.median()) * 1e3, color=VERMILLION, lw=1.2, label="median")
+    milliseconds = 1e3 * seconds
+    ax.hist(milliseconds.numpy(), bins=bins, color=GREEN, alpha=0.85)
+    if len(milliseconds):
+        ax.axvline(float(milliseconds.median()), color=VERMILLION, lw=1.2, label="median")
     if deadline is not None:
         ax.axvline(1e3 * deadline, color=GREY, ls="--", label="deadline")
-    ax.set_xlabel("time of a decision (ms)")
-    ax.set_ylabel("cycles")
-    ax.set_title(f"{flight.n_late} of {flight.n_cycles} decisions replaced", loc="right")
+    ax.set_xlabel(f"time of a {what} (ms)")
+    ax.set_ylabel(counted)
+    ax.set_title(title, loc="right")
     ax.legend(loc="upper right")
     return figure
 
@@ -127,11 +130,12 @@ def flight_figures(
     deadline: float | None = None,
 ) -> dict[str, Figure]:
     """All that apply, by name."""
+    replaced = f"{flight.n_late} of {flight.n_cycles} decisions replaced"
     figures: dict[str, Figure | None] = {
         "tracking": tracking_figure(flight, dispersed),
         "control": control_figure(flight),
         "accuracy": accuracy_figure(flight, certificate) if certificate is not None else None,
-        "timing": timing_figure(flight, deadline),
+        "timing": timing_figure(flight.seconds, deadline, what="decision", counted="cycles", title=replaced, bins=60),
         "limits": limits_figure(flight, dispersed),
     }
     return {name: figure for name, figure in figures.items() if figure is not None}

@@ -7,6 +7,7 @@ from matplotlib.figure import Figure
 
 from ponn_torch.guidance.descent import Landing
 from ponn_torch.guidance.touchdown import Limits, landed
+from ponn_torch.reporting.flight_figures import timing_figure
 from ponn_torch.reporting.style import BLUE, GREEN, GREY, ORANGE, SKY, VERMILLION, house_style
 
 MOST_DRAWN = 50  # landers; more say nothing more
@@ -73,25 +74,6 @@ def dispersion_figure(fleet: Landing, limits: Limits) -> Figure:
     return figure
 
 
-@house_style
-def plan_timing_figure(flight: Landing, deadline: float | None = None) -> Figure:
-    """How long the plans of one lander took."""
-    figure = Figure(figsize=(7.0, 2.8), layout="constrained")
-    ax = figure.subplots()
-    milliseconds = 1e3 * flight.seconds_per_plan
-    ax.hist(milliseconds.numpy(), bins=30, color=GREEN, alpha=0.85)
-    if len(milliseconds):
-        ax.axvline(float(milliseconds.median()), color=VERMILLION, lw=1.2, label="median")
-    if deadline is not None:
-        ax.axvline(1e3 * deadline, color=GREY, ls="--", label="deadline")
-    ax.set_xlabel("time of a plan (ms)")
-    ax.set_ylabel("plans")
-    late, kept = int(flight.n_late.sum()), int(flight.n_kept.sum())
-    ax.set_title(f"{len(milliseconds)} plans: {late} late, {kept} not found", loc="right")
-    ax.legend(loc="upper right")
-    return figure
-
-
 def landing_figures(
     flight: Landing, fleet: Landing | None = None, limits: Limits | None = None, deadline: float | None = None
 ) -> dict[str, Figure]:
@@ -99,4 +81,6 @@ def landing_figures(
     figures = {"trajectory": trajectory_figure(flight, fleet), "thrust": thrust_figure(flight, fleet)}
     if fleet is not None:
         figures["dispersion"] = dispersion_figure(fleet, limits or Limits())
-    return figures | {"timing": plan_timing_figure(flight, deadline)}
+    seconds, late, kept = flight.seconds_per_plan, int(flight.n_late.sum()), int(flight.n_kept.sum())
+    title = f"{len(seconds)} plans: {late} late, {kept} not found"
+    return figures | {"timing": timing_figure(seconds, deadline, what="plan", counted="plans", title=title, bins=30)}
