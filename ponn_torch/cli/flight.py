@@ -111,7 +111,7 @@ class FlightJob:
             self.mission.keep(self.folder, outcome)
 
     def screen(self, outcome: Outcome, seconds: float) -> str:
-        lines = ["", *(self.mission.screen(outcome) if self.mission is not None else [])]
+        lines = ["", *(self.mission.screen() if self.mission is not None else [])]
         lines += [f"{'CPU time':12}{seconds:.1f} s in all", f"{'folder':12}{self.folder}"]
         if outcome.exit_code != DONE and not any(outcome.message in line for line in lines):
             lines.append(f"{'ended':12}{outcome.message}")
