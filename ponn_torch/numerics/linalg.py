@@ -9,10 +9,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import torch
 from torch import Tensor
+
+from ponn_torch.numerics.tape import Replay, recordable
 
 
 def least_squares(matrix: Tensor, ridge: float = 0.0) -> Callable[[Tensor], Tensor]:
@@ -121,6 +123,12 @@ class DenseJacobian:
         return _shortest(scaled, factor, right).squeeze(-1) / scale
 
 
+@lru_cache(maxsize=256)
+def _replay(*of: object) -> Replay:
+    """The tape of a function for arrays of given shapes."""
+    return Replay()
+
+
 @dataclass(frozen=True)
 class ArrowJacobian:
     """K segments with unknowns of their own, coupled by a few shared ones.
@@ -186,11 +194,35 @@ class ArrowJacobian:
         return ArrowJacobian(column * self.local, column * self.shared, extra.unsqueeze(-1) * self.extra, self.index)
 
     def column_norms(self) -> Tensor:
-        own = torch.linalg.vector_norm(self.local, dim=-2).flatten(-2)
-        shared = self._scatter_matrix(self.shared.mT @ self.shared).diagonal(dim1=-2, dim2=-1)
-        return torch.cat([own, (shared + (self.extra**2).sum(-2)).sqrt()], -1)
+        own, _, shared = self._normal
+        return self._played(ArrowJacobian._norms, own, shared)[0]
+
+    def _norms(self, own: Tensor, shared: Tensor) -> tuple[Tensor]:
+        """Column norms by the blocks of the normal matrix."""
+        own = own.diagonal(dim1=-2, dim2=-1).flatten(-2)
+        shared = self._scatter_matrix(shared).diagonal(dim1=-2, dim2=-1) + self.extra.square().sum(-2)
+        return (torch.cat([own, shared], -1).sqrt(),)
 
     def gradient(self, residual: Tensor) -> Tensor:
+        if id(residual) not in self._gradients:
+            self._gradients[id(residual)] = residual, self._gradient(residual)
+        return self._gradients[id(residual)][1]
+
+    @cached_property
+    def _gradients(self) -> dict[int, tuple[Tensor, Tensor]]:
+        """Jᵀ r by the id of r, which is kept so that the id stays its own: a step asks for it, and its prediction."""
+        return {}
+
+    def _played(self, function: Callable[..., tuple[Tensor, ...]], *inputs: Tensor) -> tuple[Tensor, ...]:
+        """``function(self, *inputs)``, from a tape for all Jacobians of these shapes once that pays."""
+        arrays = (self.local, self.shared, self.extra, self.index, *inputs)
+        if not recordable(*arrays):
+            return function(self, *inputs)
+        replay = _replay(function, *(x.shape for x in arrays), self.local.dtype, self.local.device)
+        # of a copy, which keeps nothing that was computed before
+        return replay(lambda: function(ArrowJacobian(*arrays[:4]), *inputs), *arrays)
+
+    def _gradient(self, residual: Tensor) -> Tensor:
         segments, extra = self._split_rows(residual)
         column = segments.unsqueeze(-1)
         own = (self.local.mT @ column).flatten(-3)
@@ -237,16 +269,24 @@ class ArrowJacobian:
         return vector[..., : self.n_own].unflatten(-1, (k, own)), vector[..., self.n_own :]
 
     def _by_cholesky(self, residual: Tensor, damping: Tensor, scale: Tensor) -> Tensor:
-        own, mixed, shared = self._normal
+        step, gradient = self._played(ArrowJacobian._step, *self._normal, residual, damping, scale)
+        self._gradients[id(residual)] = residual, gradient
+        return step
+
+    def _step(
+        self, own: Tensor, mixed: Tensor, shared: Tensor, residual: Tensor, damping: Tensor, scale: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """The damped step by the blocks of the normal matrix, and Jᵀ r."""
+        gradient = self._gradient(residual)
         scale_own, scale_shared = self._split_columns(scale)
-        gradient_own, gradient_shared = self._split_columns(self.gradient(residual))
+        gradient_own, gradient_shared = self._split_columns(gradient)
         solved = _cholesky_solve(own, scale_own, damping, torch.cat([mixed, gradient_own.unsqueeze(-1)], -1))
         by_shared, by_residual = solved[..., :-1], solved[..., -1]
         schur = self._scatter_matrix(shared - mixed.mT @ by_shared) + self.extra.mT @ self.extra
         reduced = gradient_shared - self._scatter((mixed.mT @ by_residual.unsqueeze(-1)).squeeze(-1))
         step = _cholesky_solve(schur, scale_shared, damping[..., 0], -reduced.unsqueeze(-1)).squeeze(-1)
         inner = -by_residual - (by_shared @ self._gather(step).unsqueeze(-1)).squeeze(-1)
-        return torch.cat([inner.flatten(-2), step], -1)
+        return torch.cat([inner.flatten(-2), step], -1), gradient
 
     def _by_qr(self, residual: Tensor, damping: Tensor, scale: Tensor) -> Tensor:
         n, g = self.local.shape[-1], self.n_shared

@@ -225,6 +225,20 @@ class Collocation:
         t = times[..., :-1, None] + h[..., None] * (self.discretisation.nodes.points + 1.0)
         return t.unsqueeze(-1), self.discretisation.assemble(pieces)
 
+    def on_each(self, unknowns: Unknowns, z: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """t (..., K, m), w and ẇ (..., K, m, 2n) at the same z (m,) of every segment."""
+        disc, times = self.discretisation, unknowns.times
+        h = (times[..., 1:] - times[..., :-1]) / 2
+        jets = disc.expressions.jets_at(z, unknowns.weights, self.kappas(unknowns, h)[0])
+        values, rates = [], []
+        for group, jet in zip(disc.groups, jets, strict=True):
+            for e in range(group.order):
+                scale = (h[..., None] ** e * group.factors[:, e])[..., None]
+                values.append(jet[..., e, :] / scale)
+                rates.append(jet[..., e + 1, :] / (h[..., None, None] * scale))
+        t = times[..., :-1, None] + h[..., None] * (z + 1.0)
+        return t, disc.assemble(values), disc.assemble(rates)
+
     def along(self, unknowns: Unknowns, t: Tensor, segment: Tensor) -> Tensor:
         """w (..., m, 2n) at scaled times (..., m), each on a given segment (..., m)."""
         batch, k = t.shape[:-1], self.n_segments

@@ -47,29 +47,14 @@ class Curve:
         interior = self.times[1:-1].contiguous()
         return torch.searchsorted(interior, t.contiguous(), right=True)
 
-    def _at(self, z: Tensor, which: int | slice) -> tuple[Tensor, Tensor, Tensor]:
-        """(t, w, ẇ) at z (m,) of one segment, or of several with a leading axis."""
-        disc, unknowns = self.collocation.discretisation, self.unknowns
-        half = (self.times[1:] - self.times[:-1]) / 2
-        kappas, _ = self.collocation.kappas(unknowns, half)
-        jets = disc.expressions.jets_at(z, unknowns.weights[which], [kappa[which] for kappa in kappas])
-        h = half[which]
-        values, rates = [], []
-        for group, jet in zip(disc.groups, jets, strict=True):
-            for e in range(group.order):
-                scale = (h[..., None] ** e * group.factors[:, e])[..., None]
-                values.append(jet[..., e, :] / scale)
-                rates.append(jet[..., e + 1, :] / (h[..., None, None] * scale))
-        t = self.times[:-1][which].unsqueeze(-1) + h.unsqueeze(-1) * (z + 1.0)
-        return t, disc.assemble(values), disc.assemble(rates)
-
     def on_segment(self, z: Tensor, segment: int) -> tuple[Tensor, Tensor, Tensor]:
         """(t (m,), w (m, 2n), ẇ (m, 2n)) at z ∈ [−1, 1] of one segment; chained entries of ẇ are exact derivatives."""
-        return self._at(z, segment)
+        t, w, rate = self.collocation.on_each(self.unknowns, z)
+        return t[segment], w[segment], rate[segment]
 
     def on_segments(self, z: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """As ``on_segment`` at the same z (m,) of every segment, one after the other (K·m, ·); and each one's index."""
-        t, w, rate = self._at(z, slice(None))
+        t, w, rate = self.collocation.on_each(self.unknowns, z)
         index = torch.arange(len(t), device=t.device).repeat_interleave(len(z))
         return t.flatten(), w.flatten(0, 1), rate.flatten(0, 1), index
 

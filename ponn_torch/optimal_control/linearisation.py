@@ -89,8 +89,8 @@ def _by_half_length(
         # κ_e carries h^e
         by_h = torch.einsum("onk,...dk->...don", group.Omega, powers * kappa) * per_length[..., None]
         for e in range(group.order):
-            scale = (h[..., None] ** e * group.factors[:, e])[..., None]
-            moved.append((by_h[..., e, :] - e * per_length * jet[..., e, :]) / scale)
+            change = by_h[..., e, :] - e * per_length * jet[..., e, :] if e else by_h[..., 0, :]
+            moved.append(change / (h[..., None] ** e * group.factors[:, e])[..., None])
         tops.append(by_h[..., -1, :])
     by_points = (by_w @ torch.cat(moved, -2).mT.unsqueeze(-1)).squeeze(-1)
     total = by_points + by_t * (disc.nodes.points + 1.0)[:, None]
