@@ -9,6 +9,7 @@ from hydra import compose, initialize_config_dir
 from omegaconf import DictConfig, OmegaConf
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from test_configs import CONFIGS, calls
+from torch import Tensor
 
 from ponn_torch.cli import guide
 from ponn_torch.cli.flight import KINDS, build, run
@@ -17,6 +18,7 @@ from ponn_torch.cli.overrides import RHC, groups, read
 from ponn_torch.cli.tracking import Tracking
 from ponn_torch.guidance import closed_loop
 from ponn_torch.guidance.storage import load_flight
+from ponn_torch.guidance.tracking import Plant
 from ponn_torch.settings import ROOMS, target
 
 ROOT = CONFIGS / "rhc"
@@ -178,6 +180,27 @@ def test_an_interrupted_flight_is_kept(tmp_path: Path, monkeypatch: pytest.Monke
     assert [json.loads(line)["event"] for line in lines] == ["cycle"] * 3 + ["failure"]
     assert "interrupted" in (tmp_path / "failure.txt").read_text(encoding="utf-8")
     assert "Not certified" in (tmp_path / "report.md").read_text(encoding="utf-8")
+
+
+def test_an_interrupted_monte_carlo_is_told_and_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    flown, fleets = Plant.fly, []
+
+    def interrupted(plant: Plant, t: float, x: Tensor, *arguments: object) -> Tensor:
+        fleets.extend([x] * (x.dim() == 2))
+        if len(fleets) == 3:
+            raise KeyboardInterrupt
+        return flown(plant, t, x, *arguments)
+
+    monkeypatch.setattr(Plant, "fly", interrupted)
+    overrides = ["problem.horizon=100", "problem.final_time=50", "n_vehicles=3", "record=minimal"]
+    outcome = run(composed(*overrides), tmp_path, overrides)
+    assert outcome.exit_code == 130
+    assert load_flight(tmp_path / "flight").completed
+    fleet = load_flight(tmp_path / "monte_carlo")
+    assert (fleet.completed, fleet.n_cycles) == (False, 2)
+    lines = (tmp_path / "records.jsonl").read_text(encoding="utf-8").splitlines()
+    assert [json.loads(line)["event"] for line in lines] == ["cycle"] * 5 + ["certificate", "failure"]
+    assert "Monte Carlo" not in (tmp_path / "report.md").read_text(encoding="utf-8")
 
 
 def test_an_error_inside_leaves_its_reason(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -104,11 +104,14 @@ class Tracking(Mission[TrackingProblem, Flight, GuidanceCertificate]):
         certificate = certify(self.flight, checker, self.table, n_samples=self.n_samples, allowed=self.allowed)
         outcome = self.judged(certificate, recorder)
         if self.n_vehicles:
-            self._disperse(planner)
+            self.fleet = self._dispersed(planner)
+            if not self.fleet.completed:
+                return self.interrupted(self.flight, recorder)
+            self.summary = _summary(self.fleet)
             recorder.monte_carlo(self.summary)
         return outcome
 
-    def _disperse(self, planner: Planner) -> None:
+    def _dispersed(self, planner: Planner) -> Flight:
         """Fly all vehicles at once, by a schedule where one is exact."""
         problem = self.problem
         controller: Controller = HorizonController(planner, self.table)
@@ -116,14 +119,7 @@ class Tracking(Mission[TrackingProblem, Flight, GuidanceCertificate]):
             controller = gain_schedule(planner, self.table, with_loss=False)
         starts = problem.disperse(self.n_vehicles, self.common.generator(1))
         loop = replace(self.loop, deadline=None)  # one decision for all of them
-        self.fleet = fly(problem, controller, self.table, starts, loop, generator=self.common.generator(2))
-        last = self.fleet.errors[-1].abs().amax(0).tolist()
-        states = problem.plant.states.items()
-        self.summary = {
-            "n_vehicles": self.n_vehicles,
-            "final_errors": {name: value / unit.size for (name, unit), value in zip(states, last, strict=True)},
-            "peaks": {name: float(values.max()) for name, values in self.fleet.limits().items()},
-        }
+        return fly(problem, controller, self.table, starts, loop, generator=self.common.generator(2))
 
     def result(self, flight: Flight) -> tuple[float, float]:
         return float(flight.cost), float(flight.times[-1]) / self.problem.plant.time.size
@@ -146,6 +142,16 @@ class Tracking(Mission[TrackingProblem, Flight, GuidanceCertificate]):
             worst = ", ".join(f"|{name}| ≤ {value:.3g}" for name, value in self.summary["final_errors"].items())
             lines.append(f"{'Monte Carlo':12}{self.summary['n_vehicles']} vehicles, at the end {worst}")
         return lines
+
+
+def _summary(fleet: Flight) -> dict[str, Any]:
+    """Of a Monte Carlo, plain numbers."""
+    last, states = fleet.errors[-1].abs().amax(0).tolist(), fleet.problem.plant.states.items()
+    return {
+        "n_vehicles": fleet.states.shape[1],
+        "final_errors": {name: value / unit.size for (name, unit), value in zip(states, last, strict=True)},
+        "peaks": {name: float(values.max()) for name, values in fleet.limits().items()},
+    }
 
 
 def _in_plant_units(loop: Loop, problem: TrackingProblem) -> Loop:
