@@ -26,6 +26,8 @@ from ponn_torch.optimal_control.discretisation import Discretisation, Strong, di
 from ponn_torch.optimal_control.pontryagin import BoundaryValueProblem
 from ponn_torch.solving.guess import project
 
+WORST = 0.01  # of the largest residual between the nodes: segments that are halved first
+
 MakeCallback = Callable[[Collocation], Callback]
 
 
@@ -127,14 +129,15 @@ class Segmentation:
     def solved(self, result: OptimizeResult) -> bool:
         return float(result.norm) < self.residual_tolerance
 
-    def coarse(self, curve: Curve) -> Tensor:
-        """Segments (K,) whose equations do not hold between the nodes.
+    def coarse(self, curve: Curve, solved: bool = True) -> Tensor:
+        """Segments (K,) whose equations do not hold between the nodes; of a curve that is not solved, the worst ones.
 
         A segment's residual counts by its share of the time, as it does in what is flown: on an arc of a thousandth of
         the whole, round-off alone in its second derivatives is above any tight tolerance.
         """
         share = (curve.times[1:] - curve.times[:-1]) / (curve.times[-1] - curve.times[0])
-        fine = curve.off_node_residuals() * share * self.n_segments <= self.off_node_tolerance
+        missed = curve.off_node_residuals() * share * self.n_segments
+        fine = missed <= (self.off_node_tolerance if solved else WORST * missed.max())
         return ~fine  # NaN is not fine
 
 

@@ -83,7 +83,8 @@ class Solver:
         optimizer, continuation, guess: of the smoothed stages. refinement: None to stop at the smoothed solution.
         n_starts: random starts to try at most; start i of seed s uses the random stream 1000 s + i.
         n_certified: stop at this many certified extremals and keep the cheapest; several extremals are real.
-        start_limit: ‖r‖ of the first stage above which a start has failed.
+        start_limit: ‖r‖ of the first stage above which a start has failed; where nothing is smoothed and the iteration
+            has settled, it is the ansatz that is too coarse, and the refinement goes on from there.
         warm_damping: first damping of a stage that starts from the one before, if the optimiser asks for more.
         stage_tolerance: ‖r‖ at which a stage ends that only leads to a refinement, if the optimiser asks for less.
         trust: a stage is kept while its off-node residual is below this fraction of the largest rate; below the
@@ -331,6 +332,9 @@ class _Run:
             # measurements need not fit: what counts are the equations
             norm = float(result.norm if self.measurements is None else trial.residual(result.xi).norm())
             failed = not norm < solver.start_limit
+            if first and failed and self._coarse(result):
+                kept.append(solution)  # what a refinement on segments starts from, if not a solution
+                return Outcome.ABORT
             if first and failed:
                 message = (
                     f"start {self.start + 1} of seed {self.seed} failed: ‖r‖ = {norm:.2g} "
@@ -358,6 +362,13 @@ class _Run:
 
         solver.continuation.run(attempt)
         return kept, message
+
+    def _coarse(self, result: OptimizeResult) -> bool:
+        """Whether a stage of large residual is best as it is: nothing is smoothed, and the iteration has settled.
+
+        Another start would settle at the same curve; more segments do not.
+        """
+        return self.solver.exact and not self._smoothable and self.bvp.law.n_switching == 0 and result.status.stationary
 
     def _trusted(self, solution: Solution) -> bool:
         """Whether the stage's equations hold between the nodes too (a weak form claims its moments only).

@@ -149,7 +149,7 @@ class Split(Segmentation):
             solved, found = self.solved(result), claimed_structure(solution)
             if solved and any(found.near(other, SAME_SWITCH) for other in seen):
                 continue
-            repairs, coarse = self._repairs(solution, solved), self.coarse(solution)
+            repairs, coarse = self._repairs(solution, solved), self.coarse(solution, solved or regime.arcs is not None)
             if not solved:
                 outcome = Outcome.RESIDUAL
             elif repairs:
@@ -158,7 +158,8 @@ class Split(Segmentation):
                 curve, outcome = solution, Outcome.COARSE
                 if not bool(coarse.any()):
                     return Refined(curve, Outcome.SOLVED, rounds)
-            legible = float(result.norm) < min(LEGIBLE, 0.1 * norm)
+            # without arcs there is nothing to be misread
+            legible = float(result.norm) < (0.9 * norm if regime.arcs is None else min(LEGIBLE, 0.1 * norm))
             if not repairs and bool(coarse.any()) and (solved or legible):
                 # also where nothing but the resolution keeps the residual up, as long as that helps
                 halved = Segments(solution.times, segments.events, segments.arcs).halved(coarse)

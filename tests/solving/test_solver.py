@@ -19,7 +19,7 @@ from ponn_torch.optimal_control.control_laws import Unconstrained
 from ponn_torch.optimal_control.curve import Curve
 from ponn_torch.optimal_control.pontryagin import pontryagin
 from ponn_torch.optimal_control.problem import OptimalControlProblem
-from ponn_torch.problems.boundary_layer import exact_cost
+from ponn_torch.problems.boundary_layer import boundary_layer, exact_cost
 from ponn_torch.problems.earth_mars import EARTH_VENUS
 from ponn_torch.solving.certificate import certify
 from ponn_torch.solving.continuation import Adaptive, Ladder, Single
@@ -437,6 +437,17 @@ def test_a_budget_ends_a_solve_that_keeps_what_it_had(monkeypatch, evaluations, 
     assert result.cpu_seconds > evaluations
     assert len(result.stages) == stages
     assert (result.stages[0].n_iterations == 1) == (stages == 1)
+
+
+def test_a_layer_that_no_single_polynomial_follows_is_left_to_the_segments():
+    """The first stage settles at half of the norm it began with; every start would."""
+    result = Solver().solve(boundary_layer(epsilon=0.002))
+    assert result.certified
+    assert result.n_starts == 1
+    smooth = result.stages[0]
+    assert smooth.norm > Solver().start_limit
+    assert smooth.status.stationary
+    assert result.solution.cost == pytest.approx(exact_cost(0.002, 1.0, 0.0, 1.0), rel=1e-12)
 
 
 def test_no_bounds_means_no_smoothing_and_one_stage():
