@@ -1,9 +1,9 @@
 """Evidence on a failed solve: is the fixed final time shorter than the shortest one?
 
 The minimum-time twin of a problem has its dynamics, ends and controls, a free final time, and that time as the cost.
-Where its certified extremal takes longer than the problem allows, the problem is called infeasible; where it takes
-less, or is not certified itself, nothing is claimed. An extremal satisfies necessary conditions, so this is evidence
-and not a proof.
+Where its certified extremal takes longer than the problem allows, the problem is called infeasible unless a quicker
+one exists: an extremal satisfies necessary conditions, and there may be several, so this is evidence and not a proof.
+Where it takes less, the problem is feasible; where it is not certified itself, nothing is claimed.
 """
 
 from __future__ import annotations
@@ -24,7 +24,8 @@ class Feasibility:
     """What the minimum-time twin says; times in s.
 
     Attributes:
-        final_time: the fixed one. minimum_time: of the twin's certified extremal, None where it has none.
+        final_time: the fixed one. minimum_time: that of the twin's certified extremal, locally the shortest at best;
+            None where it has none.
         cpu_seconds: of the twin, its certificate apart.
         clock: the unit that the message is written in.
     """
@@ -36,6 +37,7 @@ class Feasibility:
 
     @property
     def infeasible(self) -> bool:
+        """As far as the extremal found tells."""
         return self.minimum_time is not None and self.minimum_time > self.final_time
 
     @property
@@ -44,8 +46,9 @@ class Feasibility:
             return "whether it is feasible is not known: its minimum-time problem was not certified either"
         least, given = (f"{t / self.clock.size:.8g} {self.clock.label}" for t in (self.minimum_time, self.final_time))
         if self.infeasible:
-            return f"infeasible: the minimum time is {least} (certified), more than final_time = {given}"
-        return f"not for want of time: the minimum time is {least} (certified), final_time = {given}"
+            found = f"the minimum-time extremal found (certified) takes {least}, more than final_time = {given}"
+            return f"infeasible unless a quicker one exists: {found}"
+        return f"not for want of time: a minimum-time extremal (certified) takes {least}, final_time = {given}"
 
 
 def minimum_time_twin(problem: OptimalControlProblem) -> OptimalControlProblem:
