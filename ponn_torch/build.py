@@ -37,6 +37,7 @@ from ponn_torch.settings import (
     short,
     target,
     types_of,
+    users_line,
     value_of,
 )
 from ponn_torch.solving.solver import Solver
@@ -130,9 +131,12 @@ def build_problem(node: Mapping[str, Any]) -> OptimalControlProblem:
     try:
         return load_problem(reference, **arguments)
     except (ValueError, TypeError) as error:
-        if isinstance(error, TypeError) and not raised_here(error):
-            raise  # a slip in the user's code: its traceback is worth more than a line
-        raise ConfigError(located(error, path, parameters, label=label)) from error
+        told, place = located(error, path, parameters, label=label), users_line(error)
+        if place is not None and not told.startswith(f"{path}."):  # about the user's code, not an argument of it
+            told = f"{place}: {told.removeprefix(f'{path}: ')}"
+            if not raised_here(error):
+                raise  # a slip that this package has no words for: the run keeps its traceback
+        raise ConfigError(told) from error
 
 
 # -- the parts of a solve --------------------------------------------------------------------------

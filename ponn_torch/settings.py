@@ -5,10 +5,14 @@ from __future__ import annotations
 import importlib
 import inspect
 import math
+import os
 import re
+import sysconfig
+import traceback
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import is_dataclass
 from difflib import get_close_matches
+from pathlib import Path
 from types import NoneType, UnionType
 from typing import Any, Union, get_args, get_origin, get_type_hints
 
@@ -36,6 +40,10 @@ PLACES = {
     "path": "data.path",
 }
 KINDS = {float: "a number", int: "an integer", bool: "true or false", str: "text", NoneType: "null"}
+
+
+# Folders of code that is no user's: this package and Python's library.
+INSTALLED = (f"{Path(__file__).parent}{os.sep}", f"{sysconfig.get_path('stdlib')}{os.sep}")
 
 
 class ConfigError(ValueError):
@@ -176,6 +184,16 @@ def raised_here(error: BaseException) -> bool:
     while trace is not None and trace.tb_next is not None:
         trace = trace.tb_next
     return trace is not None and str(trace.tb_frame.f_globals.get("__name__", "")).startswith("ponn_torch.")
+
+
+def users_line(error: BaseException) -> str | None:
+    """``file.py:line`` of the innermost code in an error's traceback that is neither this package's nor installed."""
+    frames = [(frame.f_code.co_filename, line) for frame, line in traceback.walk_tb(error.__traceback__)]
+    if isinstance(error, SyntaxError) and error.filename is not None:  # the code that cannot be read has no frame
+        frames.append((error.filename, error.lineno or 0))
+    own = [(Path(name), line) for name, line in frames if not name.startswith((*INSTALLED, "<"))]
+    own = [(path, line) for path, line in own if "site-packages" not in path.parts]
+    return f"{own[-1][0].name}:{own[-1][1]}" if own else None
 
 
 def located(error: Exception, path: str, parameters: Sequence[str], label: str | None = None) -> str:

@@ -18,7 +18,7 @@ from ponn_torch.cli.overrides import read
 from ponn_torch.solving.solution import Solution
 
 OWN_PROBLEM = """
-from ponn_torch.optimal_control.control_laws import Unconstrained
+from ponn_torch.optimal_control.control_laws import Box, Unconstrained
 from ponn_torch.optimal_control.problem import OptimalControlProblem
 
 
@@ -39,6 +39,19 @@ def shift(distance: float = 1.0, time: float = 1.0) -> OptimalControlProblem:
 
 def broken() -> OptimalControlProblem:
     return undefined_name
+
+
+def pushed(bound="1", speed="v") -> OptimalControlProblem:
+    return OptimalControlProblem(
+        name="pushed",
+        states={"x": 1, "v": 1},
+        control=Box("force", maximum=bound),
+        dynamics=lambda t, x, u, p: {"x": getattr(x, speed), "v": u.force},
+        running_cost=lambda t, x, u, p: u.force,
+        initial={"x": 0.0, "v": 0.0},
+        final={"x": 1.0},
+        final_time=1.0,
+    )
 """
 LANDING = ["problem=mars_landing", "record=minimal"]
 HOPELESS = [*LANDING, "explain=false", "n_starts=1", "ansatz.size=4", "optimizer.stopping.max_iterations=1"]
@@ -195,15 +208,44 @@ def test_own_problem_from_a_file(own_problem: Path, tmp_path: Path) -> None:
     assert Solution.load(folder / "solution").problem.name == "shift"
 
 
-def test_a_slip_in_an_own_problem_keeps_its_traceback(
-    own_problem: Path, capsys: pytest.CaptureFixture[str], tmp_path: Path
+@pytest.mark.parametrize(
+    ("source", "settings", "told"),
+    [
+        ("", ["broken"], "my problem.py:22: NameError: name 'undefined_name' is not defined"),
+        ("", ["pushed", "bound=1", "speed=w"], "my problem.py:30: AttributeError: no entry named 'w'; allowed: x, v"),
+        ("", ["shift", "time=long"], "my problem.py:7: TypeError: '<' not supported between"),
+        ("from nowhere import anything", ["shift"], "my problem.py:36: ModuleNotFoundError: No module named 'nowhere'"),
+        ("def :", ["shift"], "my problem.py:36: SyntaxError: invalid syntax"),
+    ],
+)
+def test_a_slip_in_an_own_problem_is_told_with_its_line(
+    source: str, settings: list[str], told: str, own_problem: Path, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
-    folder = tmp_path / "run"
-    assert main([f"problem={own_problem}:broken", f"hydra.run.dir='{folder}'"]) == 3
+    own_problem.write_text(OWN_PROBLEM + source, encoding="utf-8")
+    folder, (function, *arguments) = tmp_path / "run", settings
+    given = [f"problem.arguments.{text}" for text in arguments]
+    assert main([f"problem={own_problem}:{function}", *given, f"hydra.run.dir='{folder}'"]) == 1
     printed = capsys.readouterr()
-    assert "NameError: name 'undefined_name' is not defined" in printed.out
+    assert f"ended       {told}" in printed.out
     assert "Traceback" not in printed.out + printed.err
-    assert "my problem.py:22 in broken" in (folder / "failure.txt").read_text(encoding="utf-8")
+    kept = (folder / "failure.txt").read_text(encoding="utf-8")
+    assert kept.startswith(told)
+    assert "raised as" in kept
+    assert outcome_in(folder)["exit_code"] == 1
+
+
+def test_what_an_own_problem_states_wrongly_is_told_with_its_line(
+    own_problem: Path, capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    for bound, told in (
+        ("[1.0]", "my problem.py:29: force: maximum = [1.0]; allowed: a finite number"),
+        ("'1'", "my problem.py:26: maximum of the control = '1'; allowed: a number"),
+    ):
+        assert main([f"problem={own_problem}:pushed", f"problem.arguments.bound={bound}"]) == 1
+        (line,) = capsys.readouterr().err.splitlines()
+        assert line.startswith(f"ponn: {told}")
+    assert list(tmp_path.iterdir()) == [own_problem]  # no run folder for what was never run
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])

@@ -25,7 +25,7 @@ from ponn_torch.reporting.report import (
     REPORT,
     write_failure,
 )
-from ponn_torch.settings import ConfigError, one_line
+from ponn_torch.settings import ConfigError, one_line, users_line
 
 DONE, BAD_INPUT, NOT_CERTIFIED, BUG, INTERRUPTED = 0, 1, 2, 3, 130
 CONFIG, OVERRIDES, CHECKPOINTS = "config.yaml", "overrides.yaml", "checkpoints"
@@ -88,7 +88,8 @@ def run_job(job: Job, folder: Path, overrides: Sequence[str], *, resume: bool = 
     except KeyboardInterrupt:
         outcome = Outcome(INTERRUPTED, "interrupted; what was computed so far is kept")
     except Exception as bug:
-        error, outcome = bug, Outcome(BUG, f"{type(bug).__name__}: {one_line(bug)}")
+        error, told, place = bug, f"{type(bug).__name__}: {one_line(bug)}", users_line(bug)
+        outcome = Outcome(BUG, told) if place is None else Outcome(BAD_INPUT, f"{place}: {told}")
     spent = time.process_time() - began
     outcome = replace(job.completed(outcome), overrides=list(overrides), cpu_seconds=spent)
     if outcome.exit_code != DONE:

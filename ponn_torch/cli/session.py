@@ -59,7 +59,7 @@ def execute(command: Command, tool: Tool) -> int:
             plan = tool.build(command.config)
         except ConfigError as error:
             raise InputError(error) from error
-        except Exception:  # a slip in a user's problem: the run itself meets it again and keeps the traceback
+        except Exception:  # a slip in a user's problem: the run itself meets it again and keeps its place
             plan = None
     outcomes: list[Outcome] = []
 
@@ -83,6 +83,8 @@ def _go_on(config: DictConfig, folder: Path, overrides: list[str], tool: Tool) -
         tool.build(config)
     except ConfigError as error:
         raise InputError(error) from error
+    except Exception:  # as in a first run
+        pass
     assert tool.resume is not None
     return tool.resume(config, folder, [*kept, *overrides]).exit_code
 

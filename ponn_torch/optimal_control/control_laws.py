@@ -12,10 +12,11 @@ constant in cost per time. Three regimes:
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from difflib import get_close_matches
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol, SupportsFloat
 
 import torch
 from torch import Tensor
@@ -254,6 +255,13 @@ class Bounded:
     switching_level: float = 0.0
     cost_rate: float | None = None
     curved: bool = False
+
+    def __post_init__(self) -> None:
+        for label in ("minimum", "maximum"):
+            bound = getattr(self, label)
+            if not (isinstance(bound, str) or (isinstance(bound, SupportsFloat) and math.isfinite(bound))):
+                allowed = "a finite number, the same for all components, or the name of a parameter"
+                raise ValueError(f"{self.name}: {label} = {bound!r}; allowed: {allowed}")
 
     def bounds(self, p: Any) -> tuple[Any, Any]:
         low, high = (getattr(p, b) if isinstance(b, str) else b for b in (self.minimum, self.maximum))

@@ -12,7 +12,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ponn_torch.optimal_control.control_laws import ControlSet
+from ponn_torch.optimal_control.control_laws import Bounded, ControlSet
 
 StateValues = Mapping[str, float | Sequence[float | None] | None]
 
@@ -29,6 +29,14 @@ def nearest(name: str, allowed: Mapping[str, Any] | Sequence[str]) -> str:
     close = get_close_matches(name, list(allowed), n=1)
     hint = f" (did you mean {close[0]!r}?)" if close else ""
     return f"allowed: {', '.join(allowed)}{hint}"
+
+
+def _finite(value: Any) -> bool:
+    """Whether a value is one finite number; text and arrays are none."""
+    try:
+        return math.isfinite(value)
+    except (TypeError, ValueError, RuntimeError):  # what is no number; what is several; torch's word for the same
+        return False
 
 
 @dataclass(frozen=True)
@@ -113,17 +121,26 @@ class OptimalControlProblem:
                     raise ValueError(f"{self.name}: {label} names {name!r}; {nearest(name, allowed)}")
         for label, mapping in (("units", self.units), ("costate_units", self.costate_units)):
             for name, value in mapping.items():
-                if not (math.isfinite(value) and value > 0):
-                    raise ValueError(f"{self.name}: {label}[{name!r}] = {value}; a positive number is needed")
+                if not (_finite(value) and value > 0):
+                    raise ValueError(f"{self.name}: {label}[{name!r}] = {value!r}; a positive number is needed")
         guess = self.final_time.guess if isinstance(self.final_time, FreeTime) else self.final_time
-        if not (math.isfinite(guess) and guess > 0):
-            raise ValueError(f"{self.name}: final_time = {guess} s; a positive number is needed")
+        if not (_finite(guess) and guess > 0):
+            raise ValueError(f"{self.name}: final_time = {guess!r} s; a positive number is needed")
         if self.running_cost is None and self.terminal_cost is None:
             raise ValueError(f"{self.name}: running_cost and terminal_cost are both missing; nothing to minimise")
         if self.mass is not None and self.mass not in self.states:
             raise ValueError(f"{self.name}: mass = {self.mass!r}; {nearest(self.mass, self.states)}")
         for label in ("initial", "final"):
             self.boundary(label)
+        for name, value in self.parameters.items():
+            if not _finite(value):
+                raise ValueError(f"{self.name}: parameters[{name!r}] = {value!r}; a finite number is needed")
+        bounded = self.control if isinstance(self.control, Bounded) else None
+        for label in ("minimum", "maximum") if bounded is not None else ():
+            bound = getattr(bounded, label)
+            if isinstance(bound, str) and bound not in self.parameters:
+                hint = nearest(bound, ["a number", *self.parameters])
+                raise ValueError(f"{self.name}: {label} of the control = {bound!r}; {hint}")
         self._probe()
 
     # -- sizes and slices ------------------------------------------------------------------------------------
@@ -184,8 +201,8 @@ class OptimalControlProblem:
             if len(entries) != size:
                 raise ValueError(f"{self.name}: {end}[{name!r}] has {len(entries)} entries; {size} are needed")
             for entry in entries:
-                if entry is not None and not math.isfinite(entry):
-                    raise ValueError(f"{self.name}: {end}[{name!r}] = {value}; finite numbers or None are needed")
+                if entry is not None and not _finite(entry):
+                    raise ValueError(f"{self.name}: {end}[{name!r}] = {value!r}; finite numbers or None are needed")
             out += [None if entry is None else float(entry) for entry in entries]
         return out
 
@@ -217,10 +234,9 @@ class OptimalControlProblem:
             ("running_cost", self.running_cost, (one, self.named(x), u, p)),
             ("terminal_cost", self.terminal_cost, (one, self.named(x), p)),
         ):
-            if function is not None and tuple(function(*args).shape) != (5, 1):
-                raise ValueError(
-                    f"{self.name}: {label} returns shape {tuple(function(*args).shape)}; (..., 1) is needed"
-                )
+            shape = (5, 1) if function is None else tuple(torch.as_tensor(function(*args)).shape)
+            if shape != (5, 1):
+                raise ValueError(f"{self.name}: {label} returns shape {shape}; (..., 1) is needed")
         if self.terminal_manifold is not None:
             shape = tuple(self.terminal_manifold(one, self.named(x), p).shape)
             if len(shape) != 2 or shape[0] != 5 or not 0 < shape[1] <= self.n_states:

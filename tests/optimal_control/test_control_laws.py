@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+import re
 from types import SimpleNamespace
 
 import pytest
@@ -223,7 +225,15 @@ def test_bounds_may_be_parameters():
     assert best.control["thrust_magnitude"].flatten().tolist() == [2.0, 0.25]
 
 
-@pytest.mark.parametrize(("minimum", "maximum"), [(-0.1, 1.0), (1.0, 1.0), (2.0, 1.0), (float("nan"), 1.0)])
+@pytest.mark.parametrize("law", [Box, ThrustBall])
+@pytest.mark.parametrize("bound", [[1.0], (0.0, 1.0), None, math.nan, math.inf], ids=repr)
+def test_a_bound_is_a_number_or_a_name(law, bound):
+    for label in ("minimum", "maximum"):
+        with pytest.raises(ValueError, match=rf"push: {label} = {re.escape(repr(bound))}; allowed: a finite number"):
+            law(**{"name": "push", "maximum": 1.0, label: bound})
+
+
+@pytest.mark.parametrize(("minimum", "maximum"), [(-0.1, 1.0), (1.0, 1.0), (2.0, 1.0)])
 def test_impossible_thrust_bounds_are_named(minimum, maximum):
     with pytest.raises(ValueError, match=rf"thrust: minimum = {minimum}, maximum = {maximum}; 0 ≤ minimum <"):
         adapted(ThrustBall("thrust", maximum, minimum), thrust_hamiltonian(tensor([[1.0, 0.0, 0.0]])))

@@ -9,7 +9,7 @@ import pytest
 import torch
 from helpers import PROBLEMS, problem, random
 
-from ponn_torch.optimal_control.control_laws import ThrustBall, Unconstrained
+from ponn_torch.optimal_control.control_laws import Box, ThrustBall, Unconstrained
 from ponn_torch.optimal_control.pontryagin import pontryagin
 from ponn_torch.optimal_control.problem import FreeTime, OptimalControlProblem
 
@@ -32,6 +32,10 @@ def rates(**changes: Any):
     return {"dynamics": lambda t, x, u, p: {"position": x.velocity, "velocity": u.force} | changes}
 
 
+def bounded(minimum: str) -> dict[str, Any]:
+    return {"control": Box("force", 1.0, minimum, size=2), "parameters": {"strength": -1.0}}
+
+
 SLIPS: list[tuple[dict[str, Any], str]] = [
     ({"initial": {"positoin": 0.0}}, "initial names 'positoin'; .*did you mean 'position'"),
     ({"final": {"velocitty": 0.0}}, "final names 'velocitty'; .*did you mean 'velocity'"),
@@ -45,6 +49,14 @@ SLIPS: list[tuple[dict[str, Any], str]] = [
     ({"final_time": -1.0}, "final_time = -1.0 s; a positive number"),
     ({"final_time": 0.0}, "final_time = 0.0 s; a positive number"),
     ({"final_time": FreeTime(math.nan)}, "final_time = nan s; a positive number"),
+    ({"final_time": "6"}, "final_time = '6' s; a positive number"),
+    ({"units": {"time": "6"}}, r"units\['time'\] = '6'; a positive number"),
+    ({"initial": {"position": ("0", 0.0)}}, r"initial\['position'\] = \('0', 0.0\); finite numbers"),
+    ({"initial": {"position": torch.zeros(2)}}, r"initial\['position'\] = tensor.*; finite numbers"),
+    ({"parameters": {"weight": "1"}}, r"parameters\['weight'\] = '1'; a finite number"),
+    (bounded("-1"), "minimum of the control = '-1'; allowed: a number, strength"),
+    (bounded("strenth"), "minimum of the control = 'strenth'; .*did you mean 'strength'"),
+    ({"running_cost": lambda t, x, u, p: 1.0}, r"running_cost returns shape \(\); \(..., 1\)"),
     ({"running_cost": None}, "running_cost and terminal_cost are both missing; nothing to minimise"),
     ({"mass": "velosity"}, "mass = 'velosity'; .*did you mean 'velocity'"),
     (rates(velocty=torch.zeros(5, 2)), "dynamics returns 'velocty'; .*did you mean 'velocity'"),
