@@ -81,6 +81,8 @@ def events_in(folder: Path) -> list[str]:
     [
         ("problm=mars_landing", ["problm", "'problem'"]),
         ("sed=3", ["sed", "'seed'"]),
+        ("resum=runs/x", ["resum", "'resume'"]),
+        ("hydra.run.dir=/dev/null/run", ["hydra.run.dir = '/dev/null/run'", "a folder that can be made"]),
         ("problem=mars_landng", ["problem = 'mars_landng'", "earth_mars", "'mars_landing'"]),
         ("problem=null", ["problem = None", "earth_mars"]),
         ("ansatz=elm_tan", ["ansatz = 'elm_tan'", "chebyshev", "'elm_tanh'"]),
@@ -386,6 +388,7 @@ def test_help_names_every_group_and_config(capsys: pytest.CaptureFixture[str]) -
     for path in configs.glob("*/*.yaml"):
         if path.parent.name not in ("hydra", "rhc"):
             assert all(path.parent.name in text and path.stem in text for text in texts)
+    assert "ponn resume=" in texts[0]
 
 
 def test_settings_can_be_listed(

@@ -129,6 +129,7 @@ INSTEAD = {
     **{name: ["ansatz.hidden=[6,6]"] for name in MLPS},
     "optimizer": ["optimizer.stopping.max_iterations=2"],
     "fixed": ["+weights.equations={v_1:3.0,lambda_m:0.1}"],
+    "sweep": ["record.tensorboard=false"],
     "quiet": ["record.figures=false", "record.tensorboard=false"],
     "refinement": [],
     "tanh_ladder": ["continuation.count=2"],

@@ -10,6 +10,7 @@ from ponn_torch.baselines.direct import TwoStage, Unstructured
 from ponn_torch.baselines.symbolic import load_casadi
 from ponn_torch.optimal_control.pontryagin import BoundaryValueProblem
 from ponn_torch.optimal_control.problem import OptimalControlProblem
+from ponn_torch.reporting.style import number, unit
 from ponn_torch.solving.feasibility import check_final_time
 from ponn_torch.solving.guess import Guess, RandomGuess, ScaledCurve
 from ponn_torch.solving.solution import Solution
@@ -58,7 +59,6 @@ def _witness(problem: OptimalControlProblem, solver: Solver, solution: Solution 
         return [f"direct collocation cannot be told of this problem: {error}"]
     if not answer.solved:
         return ["direct collocation finds no trajectory either"]
-    unit = problem.display.get("cost")
-    cost = f"{answer.cost / unit.size:.8g} {unit.label}" if unit else f"{answer.cost:.8g}"
+    cost = number(answer.cost, unit(problem, "cost"), ".8g")
     arcs = f" with arcs {'-'.join(answer.arcs)}" if answer.arcs else ""
     return [f"direct collocation finds a trajectory{arcs}, {problem.cost_name} {cost}"]

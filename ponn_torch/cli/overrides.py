@@ -219,7 +219,7 @@ def _check(overrides: Sequence[str], application: Application) -> None:
         name = override.key_or_group
         plugin = name.startswith(("hydra/", "hydra.launcher."))  # Hydra knows what is installed
         if name not in options and not plugin and override.type is OverrideType.CHANGE:
-            _check_key(base, name, list(options))
+            _check_key(base, name, [*options, *(["resume"] if application.resumable else [])])
 
 
 def _parsed(text: str) -> Override:

@@ -16,12 +16,13 @@ from ponn_torch.cli.explain import explanation
 from ponn_torch.cli.job import CHECKPOINTS, DONE, INTERRUPTED, NOT_CERTIFIED, Outcome, run_job
 from ponn_torch.cli.overrides import PONN
 from ponn_torch.cli.session import Tool, sweep_member
-from ponn_torch.optimal_control.problem import DisplayUnit
+from ponn_torch.optimal_control.problem import OptimalControlProblem
 from ponn_torch.reporting.members import BESIDES, SOLUTION
 from ponn_torch.reporting.recorder import Recorder
 from ponn_torch.reporting.records import RECORDS, RunRecorder, recorded
 from ponn_torch.reporting.reference import Reference
-from ponn_torch.reporting.report import write_report
+from ponn_torch.reporting.report import end_error_lines, verdict_table, write_report
+from ponn_torch.reporting.style import number, unit
 from ponn_torch.settings import ConfigError, one_line
 from ponn_torch.solving.certificate import Certificate
 from ponn_torch.solving.journal import Journal
@@ -221,40 +222,38 @@ def _screen(outcome: Outcome, folder: Path, plan: Plan | None, keeper: _Keeper, 
     """What a person wants to see at the end."""
     lines, certificate = [""], keeper.judged
     if certificate is not None:
-        text = certificate.to_text().splitlines()
-        # its lines on end errors, cost and time come below, with units
-        starts = ("end error of ", f"{certificate.cost_name}: ")
-        last = next((i for i, line in enumerate(text) if line.startswith(starts)), None)
         # the progress has shown the verdict, which opens the table
         first = 2 if plan is not None and plan.recording.progress else 0
-        lines += ["\n".join(text[first:last]).rstrip(), ""]
+        lines += [*verdict_table(certificate)[first:], ""]
     if plan is not None and outcome.cost is not None:
-        display, name = plan.problem.display, plan.problem.cost_name
-        cost, clock = display.get("cost", DisplayUnit("")), display.get("time", DisplayUnit("s"))
-        known = ""
-        if outcome.known_cost is not None:
-            excess = (outcome.cost - outcome.known_cost) / cost.size
-            smoothed = keeper.best is not None and keeper.best.smoothing is not None
-            what = "optimum without smoothing" if smoothed else "known optimum"
-            known = f"; {what} {outcome.known_cost / cost.size:.10g}, difference {excess:+.1e}"
-        doubt = "" if outcome.certified else ", NOT certified"
-        lines.append(f"{name:12}{outcome.cost / cost.size:.10g} {cost.label}{doubt}{known}")
-        if outcome.final_time is not None:
-            lines.append(f"{'final time':12}{outcome.final_time / clock.size:.10g} {clock.label}")
-        if outcome.switch_times:
-            times = ", ".join(f"{time / clock.size:.9g}" for time in outcome.switch_times)
-            lines.append(f"{'switches':12}{times} {clock.label} ({'-'.join(outcome.arcs)})")
+        lines += _found(outcome, plan.problem, smoothed=keeper.best is not None and keeper.best.smoothing is not None)
     if plan is not None and certificate is not None:
-        for name, flown in certificate.end_errors.items():
-            shown, alone = plan.problem.display.get(name, DisplayUnit("")), certificate.control_end_errors[name]
-            errors = (f"{value / shown.size:.1e} {shown.label}".rstrip() for value in (flown, alone))
-            lines.append("{:12}{} flown, {} by the control alone".format(f"end of {name}", *errors))
+        lines += end_error_lines(certificate, plan.problem)
     solving = sum(stage.cpu_seconds for stage in keeper.stages)
     lines.append(f"{'CPU time':12}{solving:.1f} s solving, {seconds:.1f} s in all")
     lines.append(f"{'folder':12}{folder}")
     if outcome.exit_code != DONE and (certificate is None or outcome.message != certificate.verdict):
         lines.append(f"{'ended':12}{outcome.message}")
     return "\n".join(lines)
+
+
+def _found(outcome: Outcome, problem: OptimalControlProblem, *, smoothed: bool) -> list[str]:
+    """Cost, final time and switches, in the units that people read."""
+    cost, clock, known = unit(problem, "cost"), unit(problem, "time"), ""
+    assert outcome.cost is not None
+    if outcome.known_cost is not None:
+        excess = (outcome.cost - outcome.known_cost) / cost.size
+        what = "optimum without smoothing" if smoothed else "known optimum"
+        known = f"; {what} {outcome.known_cost / cost.size:.10g}, difference {excess:+.1e}"
+    doubt = "" if outcome.certified else ", NOT certified"
+    lines = [f"{problem.cost_name:12}{number(outcome.cost, cost, '.10g')}{doubt}{known}"]
+    if outcome.final_time is not None:
+        lines.append(f"{'final time':12}{number(outcome.final_time, clock, '.10g')}")
+    if outcome.switch_times:
+        *before, last = outcome.switch_times
+        times = [f"{time / clock.size:.9g}" for time in before] + [number(last, clock, ".9g")]
+        lines.append(f"{'switches':12}{', '.join(times)} ({'-'.join(outcome.arcs)})")
+    return lines
 
 
 TOOL = Tool(PONN, build, run, member, resume)

@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from tempfile import TemporaryFile
 from types import FrameType
 from typing import Any
 
@@ -68,8 +69,11 @@ def execute(command: Command, tool: Tool) -> int:
         outcomes.append(outcome)
         return outcome.score
 
+    overrides = command.overrides
+    if command.config is not None:
+        _, overrides = _in_folder("hydra.run.dir", overrides, overrides, tool.application)
     with _termination_interrupts():
-        _under_hydra(tool.application, task, command.options, command.overrides)
+        _under_hydra(tool.application, task, command.options, overrides)
     return outcomes[0].exit_code if outcomes else 0
 
 
@@ -104,6 +108,27 @@ def _under_hydra(application: Application, task: Any, options: list[str], overri
         hydra.main(config_path=folder, config_name=name, version_base="1.3")(task)()
     finally:
         sys.argv = before
+
+
+def _in_folder(
+    key: str, overrides: Sequence[str], known: Sequence[str], application: Application
+) -> tuple[Path, list[str]]:
+    """The folder that Hydra would make, made here, and the overrides with it fixed; ``known`` ones decide on it.
+
+    Raises:
+        InputError: it cannot be made or written to.
+    """
+    about = composed(known, with_hydra=True, application=application)
+    folder = Path(str(OmegaConf.select(about, key)))
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with TemporaryFile(dir=folder):
+            pass
+    except OSError as error:
+        allowed = "a folder that can be made and written to"
+        raise InputError(f"{key} = {str(folder)!r}: {error.strerror}; allowed: {allowed}") from error
+    name = str(folder).replace("\\", "\\\\").replace("'", "\\'")
+    return folder, [*(text for text in overrides if not text.startswith(f"{key}=")), f"{key}='{name}'"]
 
 
 @contextmanager
@@ -146,16 +171,12 @@ def sweep_member(tool: Tool, config: DictConfig) -> float:
 def _sweep(command: Command, tool: Tool) -> int:
     # the folder is fixed here, so that it is known whatever becomes of the members
     plain = [text for text in command.overrides if _plain(text)]
-    about = composed(plain, with_hydra=True, application=tool.application)
-    folder = Path(str(OmegaConf.select(about, "hydra.sweep.dir")))
-    overrides = [text for text in command.overrides if not text.startswith("hydra.sweep.dir=")]
+    folder, overrides = _in_folder("hydra.sweep.dir", command.overrides, plain, tool.application)
     if not any(text.startswith("hydra.sweep.subdir=") for text in overrides):
         overrides += _named_by_what_varies(command.overrides)
-    name = str(folder).replace("\\", "\\\\").replace("'", "\\'")
     began, interrupted = time.time(), False
     try:
         with _termination_interrupts():
-            overrides = [*overrides, f"hydra.sweep.dir='{name}'"]
             _under_hydra(tool.application, tool.member, command.options, overrides)
     except KeyboardInterrupt:
         interrupted = True

@@ -21,8 +21,9 @@ Examples
   ponn problem=mars_landing problem.final_time=50   other data
   ponn problem=my_problem.py:my_problem             your own problem (a function that returns one)
   ponn experiment=ponn_landing_paper                the setting of a paper
-  ponn -m seed=0,1,2,3 record=minimal               a sweep
+  ponn -m seed=0,1,2,3 record=sweep                 a sweep
   ponn hydra.run.dir=runs/here                      into a folder of your choice
+  ponn resume=runs/here                             go on with a run that was cut short
 
 Config groups (GROUP=CONFIG; the first line of each config: ponn --config-groups)
 {groups}

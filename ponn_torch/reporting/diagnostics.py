@@ -27,6 +27,8 @@ from ponn_torch.reporting.style import (
 from ponn_torch.solving.observer import StageResult
 from ponn_torch.solving.solution import Solution
 
+SMOOTH = "smooth"  # name of the stages before a refinement
+
 
 def _logarithmic(values: Tensor) -> Tensor:
     """Values for a logarithmic axis: exact zeros are left out."""
@@ -112,9 +114,14 @@ def _band(ax: Axes, stage: StageResult, first: int, last: int, total: int, shade
     )  # fmt: skip
 
 
+def _refines(stage: StageResult) -> bool:
+    """Whether it is one of a refinement: without ρ, but not the only stage of a problem that needs none."""
+    return stage.smoothing is None and stage.name != SMOOTH
+
+
 @house_style
 def convergence_figure(stages: Sequence[StageResult]) -> Figure:
-    """‖r‖ per iteration, stage after stage; the smoothing on top, stages without smoothing coloured.
+    """‖r‖ per iteration, stage after stage; the smoothing on top, stages of a refinement coloured.
 
     Raises:
         ValueError: no stage has records.
@@ -131,7 +138,7 @@ def convergence_figure(stages: Sequence[StageResult]) -> Figure:
         at = list(range(first, first + len(stage.records)))
         norms = [float(record["norm"]) for record in stage.records]
         norm = _logarithmic(torch.tensor(norms, dtype=torch.float64))
-        colour = BLUE if stage.smoothing is not None else VERMILLION
+        colour = VERMILLION if _refines(stage) else BLUE
         colour = colour if stage.start == kept else GREY
         ax.semilogy(at, norm, color=colour, lw=1.5, marker="." if len(at) == 1 else None)
         rejected = [k for k, record in enumerate(stage.records) if not record.get("accepted", True)]
@@ -139,10 +146,12 @@ def convergence_figure(stages: Sequence[StageResult]) -> Figure:
         _band(ax, stage, first, at[-1], total, i % 2 == 1)
         first += len(at)
     handles = []
-    if any(s.smoothing is not None for s in shown):
-        handles.append(Line2D([], [], color=BLUE, label="smoothed"))
-    if any(s.smoothing is None and s.start == kept for s in shown):
-        name = next(s.name for s in reversed(shown) if s.smoothing is None)
+    ours = [stage for stage in shown if stage.start == kept]
+    if any(not _refines(stage) for stage in ours):
+        smoothed = any(stage.smoothing is not None for stage in ours)
+        handles.append(Line2D([], [], color=BLUE, label="smoothed" if smoothed else SMOOTH))
+    if any(_refines(stage) for stage in ours):
+        name = next(stage.name for stage in reversed(ours) if _refines(stage))
         handles.append(Line2D([], [], color=VERMILLION, label=name))
     if several_starts:
         handles.append(Line2D([], [], color=GREY, label="other starts"))

@@ -83,6 +83,7 @@ class TensorBoard(Recorder):
         self._step, self._stage = 0, -1
         self._start, self._cpu_start = time.perf_counter(), time.process_time()
         self._cost_tag, self._failed = f"cost/{cost_name}", False
+        self._judged, self._cost = False, math.nan
         self._figures: deque[tuple[int, Solution]] = deque(maxlen=MAX_FIGURES if figures else 0)
         experiment, begin, self._end = hparams(_hyperparameters(settings), dict.fromkeys(METRICS, 0.0))
         for summary in (experiment, begin):
@@ -132,11 +133,15 @@ class TensorBoard(Recorder):
             "stage/cpu_seconds": stage.cpu_seconds,
         }
         if math.isfinite(stage.cost):
-            values[self._cost_tag] = stage.cost
+            values[self._cost_tag] = self._cost = stage.cost
         self._scalars(values, self._step)
         self._writer.flush()
 
+    def solution(self, solution: Solution) -> None:
+        self._cost = solution.cost
+
     def certificate(self, certificate: Certificate) -> None:
+        self._judged = True
         judged = ((name, getattr(certificate, name)) for name in JUDGED)
         values = {f"certificate/{name}": float(value) for name, value in judged if value is not None}
         self._scalars(values | self._times(), self._step)
@@ -148,7 +153,13 @@ class TensorBoard(Recorder):
         self._writer.add_text("failure", reason, self._step)
 
     def close(self) -> None:
-        """Draw the stages' figures, which would have slowed the run down, and end the session."""
+        """Draw the stages' figures, which would have slowed the run down, and end the session.
+
+        A run that was never judged gets a 0 for its certificate and the cost that it reached, so that HPARAMS ranks it.
+        """
+        if not self._judged:
+            cost = {"certificate/cost": self._cost} if math.isfinite(self._cost) else {}
+            self._scalars({"certificate/certified": 0.0, **cost}, self._step)
         for step, solution in self._figures:
             image = io.BytesIO()
             figure = stage_figure(solution)

@@ -15,7 +15,7 @@ from typing import Any
 import torch
 
 import ponn_torch
-from ponn_torch.optimal_control.problem import FreeTime
+from ponn_torch.optimal_control.problem import FreeTime, OptimalControlProblem
 from ponn_torch.reporting.figures import all_figures
 from ponn_torch.reporting.recorder import finite_or_none
 from ponn_torch.reporting.style import arc_intervals, number, save, unit
@@ -142,7 +142,7 @@ def write_report(
     parts = [
         _title(solution, certificate, message),
         _result(solution) if solution is not None else "",
-        _certificate(certificate) if certificate is not None else "",
+        _certificate(certificate, solution.problem) if certificate is not None and solution is not None else "",
         _stages(stages, solution),
         _figures(drawn),
         settings_text(settings or {}),
@@ -180,8 +180,8 @@ def _result(solution: Solution) -> str:
     time, cost = unit(problem, "time"), unit(problem, "cost")
     free = " (free)" if isinstance(problem.final_time, FreeTime) else " (fixed)"
     rows = [
-        (problem.cost_name, number(solution.cost, cost, 12)),
-        ("final time", number(solution.final_time, time, 12) + free),
+        (problem.cost_name, number(solution.cost, cost, ".12g")),
+        ("final time", number(solution.final_time, time, ".12g") + free),
         (
             "kind",
             solution.kind + (f", ρ = {solution.smoothing:.3g}" if solution.smoothing is not None else ""),
@@ -189,8 +189,8 @@ def _result(solution: Solution) -> str:
         ("residual between the nodes", f"{solution.off_node_residual:.1e} (scaled)"),
     ]
     if problem.known_cost is not None:
-        rows.insert(1, ("known optimum", number(problem.known_cost, cost, 12)))
-        rows.insert(2, ("difference", number(solution.cost - problem.known_cost, cost, 3)))
+        rows.insert(1, ("known optimum", number(problem.known_cost, cost, ".12g")))
+        rows.insert(2, ("difference", number(solution.cost - problem.known_cost, cost, ".3g")))
     text = "## Result\n\n" + table(("quantity", "value"), rows)
     arcs = arc_intervals(solution)
     if arcs:
@@ -203,8 +203,29 @@ def _result(solution: Solution) -> str:
     return text
 
 
-def _certificate(certificate: Certificate) -> str:
-    return f"## Certificate\n\n```\n{certificate.to_text()}\n```"
+def verdict_table(certificate: Certificate) -> list[str]:
+    """Lines of the certificate without those that have units: the verdict, then what was measured and allowed."""
+    lines = certificate.to_text().splitlines()
+    starts = ("end error of ", f"{certificate.cost_name}: ")
+    last = next((i for i, line in enumerate(lines) if line.startswith(starts)), len(lines))
+    return "\n".join(lines[:last]).rstrip().splitlines()
+
+
+def end_error_lines(certificate: Certificate, problem: OptimalControlProblem) -> list[str]:
+    """How far both flights end off, in the units that people read."""
+    lines = []
+    for name, flown in certificate.end_errors.items():
+        shown = unit(problem, name)
+        errors = (number(value, shown, ".1e") for value in (flown, certificate.control_end_errors[name]))
+        lines.append("{:12}{} flown, {} by the control alone".format(f"end of {name}", *errors))
+    return lines
+
+
+def _certificate(certificate: Certificate, problem: OptimalControlProblem) -> str:
+    flown = number(certificate.flown_cost, unit(problem, "cost"), ".10g")
+    lines = [*verdict_table(certificate), "", *end_error_lines(certificate, problem)]
+    lines += [f"{certificate.cost_name:12}{flown} flown", f"{'CPU time':12}{certificate.seconds:.2f} s"]
+    return "\n".join(["## Certificate", "", "```", *lines, "```"])
 
 
 def _stages(stages: Sequence[StageResult], solution: Solution | None) -> str:
@@ -212,7 +233,8 @@ def _stages(stages: Sequence[StageResult], solution: Solution | None) -> str:
         return ""
     problem = solution.problem if solution is not None else None
     shown = unit(problem, "cost") if problem is not None else None
-    name = f"{problem.cost_name} ({shown.label})" if problem is not None and shown is not None else "cost"
+    name = problem.cost_name if problem is not None else "cost"
+    name += f" ({shown.label})" if shown is not None and shown.label else ""
 
     def value(number_: float, text: str) -> str:
         return format(number_, text) if number_ == number_ else "–"

@@ -133,9 +133,9 @@ def decimal_exponent(largest: float) -> int:
     return exponent if exponent > 4 or exponent < -3 else 0
 
 
-def number(value: float, shown: DisplayUnit, digits: int = 7) -> str:
+def number(value: float, shown: DisplayUnit, form: str = ".7g") -> str:
     """A value in SI as text in its display unit."""
-    return f"{value / shown.size:.{digits}g} {shown.label}".rstrip()
+    return f"{value / shown.size:{form}} {shown.label}".rstrip()
 
 
 def arc_intervals(solution: Solution) -> list[tuple[float, float, str]]:

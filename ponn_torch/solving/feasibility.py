@@ -44,7 +44,9 @@ class Feasibility:
     def message(self) -> str:
         if self.minimum_time is None:
             return "whether it is feasible is not known: its minimum-time problem was not certified either"
-        least, given = (f"{t / self.clock.size:.8g} {self.clock.label}" for t in (self.minimum_time, self.final_time))
+        least, given = (
+            f"{t / self.clock.size:.8g} {self.clock.label}".rstrip() for t in (self.minimum_time, self.final_time)
+        )
         if self.infeasible:
             found = f"the minimum-time extremal found (certified) takes {least}, more than final_time = {given}"
             return f"infeasible unless a quicker one exists: {found}"

@@ -152,6 +152,15 @@ def test_convergence_lines_up_the_stages():
     assert [list(x) for x in rejected] == [[], [], [6, 7]]
 
 
+def test_without_smoothing_the_stage_before_a_split_is_told_apart_from_it():
+    stages = [stage("smooth", None, [10.0, 1.0]), stage("split", None, [1e-3, 1e-9])]
+    ax = convergence_figure(stages).axes[0]
+    first, second = (line.get_color() for line in ax.get_lines() if line.get_linestyle() == "-")
+    handles = ax.get_legend().legend_handles
+    assert [(h.get_label(), h.get_color()) for h in handles[:2]] == [("smooth", first), ("split", second)]
+    assert first != second
+
+
 @pytest.mark.parametrize(
     ("kind", "count", "labels"),
     [

@@ -118,6 +118,16 @@ def test_records_hold_every_iteration_and_stage(runs, name):
     assert [line["certified"] for line in certificate] == [result.certificate.certified]
 
 
+def test_a_run_without_a_certificate_can_be_ranked(tmp_path):
+    with RunRecorder(tmp_path, cost_name="fuel", progress=False) as recorder:
+        result = small(start_limit=1e-300).solve(mars_landing(), observer=recorder)
+    assert result.certificate is None
+    scalars = {tag: events(tmp_path).Scalars(tag)[-1].value for tag in ("certificate/certified", "certificate/cost")}
+    reached = result.stages[-1].cost
+    assert scalars == {"certificate/certified": 0.0, "certificate/cost": pytest.approx(reached, rel=1e-6)}
+    assert math.isfinite(reached)
+
+
 class Seen:
     """A look whose answers are given, and which notes what it was asked."""
 

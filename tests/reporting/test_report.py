@@ -30,7 +30,13 @@ def reported(solved, tmp_path_factory):
 
 def test_report_holds_the_certificate(reported):
     result, folder, text = reported
-    assert result.certificate.to_text() in text
+    section = text.split("## Certificate")[1].split("##")[0]
+    table = result.certificate.to_text().split("\n\n")
+    assert table[0] in section
+    assert table[1] in section
+    assert "user units" not in text
+    alone = result.certificate.control_end_errors["r"]
+    assert f"flown, {alone:.1e} m by the control alone" in section
     saved = json.loads((folder / "certificate.json").read_text())
     assert Certificate.from_dict(saved) == result.certificate
 
