@@ -8,18 +8,20 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import Any
 
 import torch
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 
-from ponn_torch.ansatz.basis import FreeFunction
+from ponn_torch.ansatz.basis import FreeFunction, LinearBasis
 from ponn_torch.optim.base import Optimizer
 from ponn_torch.optim.chain import Chain
 from ponn_torch.optim.weighted import WeightedEquations, check_equations
 from ponn_torch.optimal_control.collocation import equation_names
+from ponn_torch.optimal_control.discretisation import Discretisation
 from ponn_torch.optimal_control.pontryagin import pontryagin
 from ponn_torch.optimal_control.problem import OptimalControlProblem, nearest
 from ponn_torch.optimal_control.references import load_problem
@@ -40,6 +42,7 @@ from ponn_torch.settings import (
     users_line,
     value_of,
 )
+from ponn_torch.solving.continuation import Ladder
 from ponn_torch.solving.solver import Solver
 
 DTYPES = {"float64": torch.float64, "float32": torch.float32}
@@ -70,7 +73,10 @@ class Recording:
 
 @dataclass(frozen=True)
 class Plan:
-    """All that a config (``settings``, resolved) asks for: solve ``problem`` by ``solver`` from ``seed``."""
+    """All that a config (``settings``, resolved) asks for: solve ``problem`` by ``solver`` from ``seed``.
+
+    notes: sentences on what is allowed and seldom meant.
+    """
 
     name: str
     problem: OptimalControlProblem
@@ -80,6 +86,7 @@ class Plan:
     threads: int
     explain: bool
     settings: dict[str, Any]
+    notes: Sequence[str] = ()
 
 
 def build(config: DictConfig) -> Plan:
@@ -96,8 +103,7 @@ def build(config: DictConfig) -> Plan:
     recording = call(Recording, _section(node, "record"), "record")
     reject_unknown(node, [key for key in settings if key not in node], "")
     plan = Plan(top["name"], problem, solver, top["seed"], recording, top["threads"], top["explain"], settings)
-    _rehearse(plan)
-    return plan
+    return replace(plan, notes=_notes(solver, _rehearse(plan)))
 
 
 def resolved(config: DictConfig) -> dict[str, Any]:
@@ -220,7 +226,7 @@ def _solver(node: dict[str, Any], top: Mapping[str, Any]) -> Solver:
     return call(Solver, fields | {"dtype": DTYPES[top["dtype"]], "device": top["device"]}, "")
 
 
-def _rehearse(plan: Plan) -> None:
+def _rehearse(plan: Plan) -> Discretisation:
     """Derive the boundary value problem, tabulate the first stage, guess: names what does not go together."""
     solver = plan.solver
     try:
@@ -237,3 +243,20 @@ def _rehearse(plan: Plan) -> None:
             solver.data.of(plan.problem)
     except ValueError as error:
         raise ConfigError(located(error, "", [*types_of(Solver), "kind"])) from error
+    return disc
+
+
+def _notes(solver: Solver, disc: Discretisation) -> list[str]:
+    """Settings that a solve may survive, and that say little about their method if it does."""
+    notes, schedule = [], solver.continuation
+    if isinstance(schedule, Ladder) and schedule.parameter == "smoothing":
+        values = list(schedule.values)
+        if any(after > before for before, after in pairwise(values)):
+            notes.append(f"continuation.values = {short(values)} rise; a ladder goes from much smoothing to little")
+    n_equations = sum(group.rows.stop - group.rows.start for group in disc.groups if not group.trivial)
+    if isinstance(solver.basis, LinearBasis) and n_equations < disc.n_own:
+        notes.append(
+            f"nodes.n_nodes = {solver.n_nodes}: {n_equations} equations for {disc.n_own} coefficients, which they do "
+            "not determine; more nodes or a smaller ansatz.size do"
+        )
+    return notes

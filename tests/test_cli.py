@@ -201,6 +201,21 @@ def test_failed_run_says_why(capsys: pytest.CaptureFixture[str], tmp_path: Path)
     assert "iteration" in events_in(tmp_path)
 
 
+@pytest.mark.parametrize(
+    ("setting", "told"),
+    [
+        ("continuation.values=[0.03,1.0]", "continuation.values = [0.03, 1.0] rise"),
+        ("nodes.n_nodes=1", "nodes.n_nodes = 1: 5 equations for 7 coefficients"),
+    ],
+)
+def test_settings_that_are_seldom_meant_are_noted(
+    setting: str, told: str, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    main([*HOPELESS, setting, f"hydra.run.dir='{tmp_path}'"])
+    assert f"note: {told}" in capsys.readouterr().out
+    assert f"- Note: {told}" in (tmp_path / "report.md").read_text(encoding="utf-8")
+
+
 def test_own_problem_from_a_file(own_problem: Path, tmp_path: Path) -> None:
     folder = tmp_path / "run"
     arguments = [f"problem={own_problem}:shift", "problem.arguments.distance=2", "record=minimal"]
@@ -349,6 +364,9 @@ def test_sweep_counts_and_explains_members_that_fail(capsys: pytest.CaptureFixtu
     printed = capsys.readouterr().out
     assert "2 of 3 certified, 1 failed" in printed
     assert "problem.initial_mass = -1" in printed.splitlines()[-4]
+    header, *rows = printed.splitlines()[-6:-2]
+    column = header.index("settings: result")
+    assert all(row[column:].startswith("problem.initial_mass=") for row in rows)
     folders = [folder / f"{i}_problem.initial_mass={mass}" for i, mass in enumerate((1905, -1, 1900))]
     outcomes = [outcome_in(member) for member in folders]
     assert [outcome["exit_code"] for outcome in outcomes] == [0, 1, 0]

@@ -25,7 +25,7 @@ from ponn_torch.reporting.report import (
     REPORT,
     write_failure,
 )
-from ponn_torch.settings import ConfigError, one_line, users_line
+from ponn_torch.settings import ConfigError, one_line
 
 DONE, BAD_INPUT, NOT_CERTIFIED, BUG, INTERRUPTED = 0, 1, 2, 3, 130
 CONFIG, OVERRIDES, CHECKPOINTS = "config.yaml", "overrides.yaml", "checkpoints"
@@ -73,8 +73,18 @@ class Job(Protocol):
         """What a person wants to see at the end."""
 
 
-def run_job(job: Job, folder: Path, overrides: Sequence[str], *, resume: bool = False) -> Outcome:
-    """Leave a complete folder; raises for nothing that happens in between. ``resume`` keeps its checkpoints."""
+def run_job(
+    job: Job,
+    folder: Path,
+    overrides: Sequence[str],
+    *,
+    resume: bool = False,
+    slip: Callable[[BaseException], str | None] = lambda error: None,
+) -> Outcome:
+    """Leave a complete folder; raises for nothing that happens in between. ``resume`` keeps its checkpoints.
+
+    ``slip`` says where in a user's own code an error was made, if it was: that is bad input, any other one a bug.
+    """
     folder.mkdir(parents=True, exist_ok=True)
     _clear(folder, (SOLUTION, FIGURES) if resume else (SOLUTION, FIGURES, CHECKPOINTS))
     began = time.process_time()
@@ -88,7 +98,7 @@ def run_job(job: Job, folder: Path, overrides: Sequence[str], *, resume: bool = 
     except KeyboardInterrupt:
         outcome = Outcome(INTERRUPTED, "interrupted; what was computed so far is kept")
     except Exception as bug:
-        error, told, place = bug, f"{type(bug).__name__}: {one_line(bug)}", users_line(bug)
+        error, told, place = bug, f"{type(bug).__name__}: {one_line(bug)}", slip(bug)
         outcome = Outcome(BUG, told) if place is None else Outcome(BAD_INPUT, f"{place}: {told}")
     spent = time.process_time() - began
     outcome = replace(job.completed(outcome), overrides=list(overrides), cpu_seconds=spent)

@@ -23,7 +23,7 @@ from ponn_torch.reporting.records import RECORDS, RunRecorder, recorded
 from ponn_torch.reporting.reference import Reference
 from ponn_torch.reporting.report import end_error_lines, verdict_table, write_report
 from ponn_torch.reporting.style import number, unit
-from ponn_torch.settings import ConfigError, one_line
+from ponn_torch.settings import ConfigError, one_line, users_line
 from ponn_torch.solving.certificate import Certificate
 from ponn_torch.solving.journal import Journal
 from ponn_torch.solving.observer import StageResult
@@ -67,13 +67,13 @@ def run(
 
     ``plan`` is used if it was built from the same config. ``choices`` name the config of each group.
     """
-    return run_job(SolveJob(config, folder, overrides, plan, choices or {}), folder, overrides)
+    return run_job(SolveJob(config, folder, overrides, plan, choices or {}), folder, overrides, slip=users_line)
 
 
 def resume(config: DictConfig, folder: Path, overrides: Sequence[str]) -> Outcome:
     """Go on with the run in a folder from its checkpoints; it ends as the uninterrupted run would have."""
     job = SolveJob(config, folder, overrides, None, _choices_before(folder), resume=True)
-    return run_job(job, folder, overrides, resume=True)
+    return run_job(job, folder, overrides, resume=True, slip=users_line)
 
 
 def _keep_choices(folder: Path, choices: Mapping[str, Any]) -> None:
@@ -147,6 +147,8 @@ class SolveJob:
         plan = self._plan
         assert plan is not None
         recording = plan.recording
+        for note in plan.notes:
+            print(f"note: {note}", flush=True)
         torch.set_num_threads(plan.threads)
         recorder = RunRecorder(
             self._folder,
@@ -211,6 +213,7 @@ class SolveJob:
                 stages=self._keeper.stages,
                 settings=plan.settings if plan is not None else None,
                 message=outcome.message,
+                notes=plan.notes if plan is not None else (),
                 figures=with_figures,
             )
 

@@ -211,14 +211,15 @@ def _summary(folder: Path, members: list[tuple[Path, dict[str, Any]]]) -> str:
     first = members[0][1]["overrides"] if len(members) > 1 else []
     shared = [text for text in first if all(text in outcome["overrides"] for _, outcome in members)]
     lines = ["", *([f"all: {' '.join(shared)}"] if shared else [])]
-    lines.append(f"{'member':8}{'cost':>16}  {'CPU s':>7}  settings: result")
+    width = max(len(name) for name in ("member", *(place.name for place, _ in members))) + 2
+    lines.append(f"{'member':{width}}{'cost':>16}  {'CPU s':>7}  settings: result")
     for place, outcome in members:
         cost = float(outcome["cost"]) if outcome["cost"] is not None else math.nan
         shown = f"{cost:>16.10g}" if math.isfinite(cost) else f"{'–':>16}"
         settings = " ".join(text for text in outcome["overrides"] if text not in shared) or "defaults"
         told = " ".join(["certified", "-".join(outcome["arcs"])]).strip()
         told = told if outcome["certified"] else outcome["message"]
-        lines.append(f"{place.name:8}{shown}  {outcome['cpu_seconds']:7.2f}  {settings}: {told}")
+        lines.append(f"{place.name:{width}}{shown}  {outcome['cpu_seconds']:7.2f}  {settings}: {told}")
     failed = sum(outcome["exit_code"] != 0 for _, outcome in members)
     certified = sum(bool(outcome["certified"]) for _, outcome in members)
     lines += ["", f"{certified} of {len(members)} certified, {failed} failed; folder {folder}"]

@@ -122,12 +122,13 @@ def write_report(
     stages: Sequence[StageResult] = (),
     settings: Mapping[str, Any] | None = None,
     message: str = "",
+    notes: Sequence[str] = (),
     figures: bool = True,
 ) -> Path:
     """Write report.md with all that is known, its figures, certificate.json and environment.json.
 
     ``solution`` and ``certificate`` may be missing, as in a failed run; ``message`` is its reason.
-    Returns the path of the report.
+    ``notes`` are remarks on its settings. Returns the path of the report.
     """
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
@@ -141,6 +142,7 @@ def write_report(
         write_json(folder / CERTIFICATE, certificate.to_dict())
     parts = [
         _title(solution, certificate, message),
+        "\n".join(f"- Note: {note}" for note in notes),
         _result(solution) if solution is not None else "",
         _certificate(certificate, solution.problem) if certificate is not None and solution is not None else "",
         _stages(stages, solution),
