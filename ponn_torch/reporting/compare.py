@@ -106,9 +106,11 @@ class Comparison:
     def _row(self, label: str, group: Sequence[Member]) -> Row:
         runs = [self.member_row(label, member) for member in group]
         found = Counter(run["extremal"] for run in runs)
+        ran = sum(member.ran for member in group)
+        failed = f" ({len(group) - ran} failed)" if ran < len(group) else ""
         row: Row = {
             "settings": label,
-            "certified": f"{sum(run['certified'] for run in runs)}/{len(runs)}",
+            "certified": f"{sum(run['certified'] for run in runs)}/{ran}{failed}",
             "extremals": " ".join(f"{letter}:{count}" for letter, count in sorted(found.items())),
         }
         whole = ("unknowns", "iterations", "residuals", "derivatives")
@@ -124,7 +126,7 @@ class Comparison:
             f"{label}, seed {member.seed}: {member.outcome['message']}"
             for label, group in self.groups.items()
             for member in group
-            if member.outcome["exit_code"] not in (0, 2) or not member.stages
+            if not member.ran or not member.stages
         ]
 
 
@@ -196,7 +198,8 @@ def write_comparison(comparisons: Sequence[Comparison], folder: Path, figures: M
         lines += ["\n".join(f"- {line}" for line in failures)] if failures else []
     lines.append(
         "Median [min, max] over the seeds. Extremals: the same letter for the same cost and initial costates, A the "
-        "cheapest, – where no residual was solved. ‖r‖, off nodes and errors are scaled; CPU s without certificates."
+        "cheapest, – where no residual was solved. Failed: bad input, an error or an interruption, no try. ‖r‖, off nodes "
+        "and errors are scaled; CPU s without certificates."
     )
     lines += [f"![{caption}]({path.name})" for caption, path in figures.items()]
     text = "\n\n".join(lines) + "\n"

@@ -53,6 +53,11 @@ class Member:
             return None
 
     @property
+    def ran(self) -> bool:
+        """It ended by itself, certified or not: no bad input, no error, no interruption."""
+        return self.outcome["exit_code"] in (0, 2)
+
+    @property
     def certified(self) -> bool:
         return bool(self.outcome["certified"])
 

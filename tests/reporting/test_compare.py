@@ -79,6 +79,7 @@ def test_one_row_a_configuration_and_one_a_member(sweep):
     assert rows[0]["certified"] == "0/2"
     assert rows[0]["extremals"] == "A:2"
     assert rows[2]["extremals"] == "–:1"
+    assert rows[2]["certified"] == "0/0 (1 failed)"  # bad input is no try
     costs = [member.cost for member in comparison.groups["size=12"]]
     assert float(rows[0]["fuel [kg]"].split()[0]) == pytest.approx(sum(costs) / 2, abs=1e-4)
     assert comparison.shared["refinement"] == "none"
