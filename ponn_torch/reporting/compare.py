@@ -198,7 +198,7 @@ def write_comparison(comparisons: Sequence[Comparison], folder: Path, figures: M
         lines += ["\n".join(f"- {line}" for line in failures)] if failures else []
     lines.append(
         "Median [min, max] over the seeds. Extremals: the same letter for the same cost and initial costates, A the "
-        "cheapest, – where no residual was solved. Failed: bad input, an error or an interruption, no try. ‖r‖, off nodes "
+        "cheapest, – where no residual was solved. Failed: bad input, an error or an interruption. ‖r‖, off nodes "
         "and errors are scaled; CPU s without certificates."
     )
     lines += [f"![{caption}]({path.name})" for caption, path in figures.items()]
