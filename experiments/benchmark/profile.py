@@ -100,8 +100,8 @@ def neighbours(repeats: int) -> Report:
     )
     solution = Solver().solve(problem, 0).solution
     assert solution is not None
-    family, generator = Family.of(solution.curve), torch.Generator().manual_seed(0)
-    start = torch.tensor(problem.boundary("initial"), dtype=torch.float64)
+    start, generator = torch.tensor(problem.boundary("initial"), dtype=torch.float64), torch.Generator().manual_seed(0)
+    family, _ = Family.of(solution.curve).restart(start[None])  # on the segments of its neighbours
     sizes = torch.tensor([SPREAD_M] * 3 + [SPREAD_M_S] * 3 + [0.0], dtype=torch.float64)
 
     def restart(count: int) -> Callable[[], Any]:

@@ -19,6 +19,9 @@ def cpu_times(calls: Mapping[str, Callable[[], Any]], repeats: int) -> dict[str,
     return out
 
 
+WARM_UP = 6  # solves of a problem, by which what it evaluates is recorded (see ponn_torch/numerics/tape.py)
+
+
 def columns(lines: Sequence[Mapping[str, str]]) -> list[dict[str, str]]:
     """Rows ↔ columns."""
     first, *others = lines[0]
