@@ -216,7 +216,7 @@ class ArrowJacobian:
     def _played(self, function: Callable[..., tuple[Tensor, ...]], *inputs: Tensor) -> tuple[Tensor, ...]:
         """``function(self, *inputs)``, from a tape for all Jacobians of these shapes once that pays."""
         arrays = (self.local, self.shared, self.extra, self.index, *inputs)
-        if not recordable(*arrays):
+        if not recordable(*arrays) or not all(x.is_contiguous() for x in arrays):
             return function(self, *inputs)
         replay = _replay(function, *(x.shape for x in arrays), self.local.dtype, self.local.device)
         # of a copy, which keeps nothing that was computed before

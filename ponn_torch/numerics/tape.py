@@ -88,7 +88,7 @@ class Replay:
 
     def __init__(self, after: int = RECORDING_PAYS) -> None:
         self._before, self._tape = after, cast(Tape | None, None)
-        self._seen: tuple[Sequence[Tensor], Sequence[Tensor]] = (), ()
+        self._seen: tuple[tuple[Tensor, ...], tuple[Tensor, ...]] = (), ()
 
     @property
     def recorded(self) -> bool:
@@ -98,13 +98,15 @@ class Replay:
         """``function()``, which reads the inputs and, in every call, the same constants."""
         if self._tape is not None:
             return self._tape.play(*inputs)
-        self._before -= 1
-        if self._before == 1:
-            self._seen = inputs, function()
-            return tuple(self._seen[1])
-        if self._before != 0:
+        before = self._before = self._before - 1
+        if before == 1:
+            expected = function()
+            self._seen = inputs, expected
+            return expected
+        (given, expected) = seen = self._seen
+        if before > 0 or not seen[0]:  # another thread may record it, or be about to
             return function()
-        (given, expected), self._seen = self._seen, ((), ())
+        self._seen = (), ()
         try:
             tape = Tape.record(function, inputs)
         except Unrecordable:
@@ -352,7 +354,10 @@ def _plain(function: Callable[..., Sequence[Tensor]]) -> Callable[..., tuple[Ten
 
     def play(*inputs: Tensor) -> tuple[Tensor, ...]:
         with torch.no_grad():
-            plain = (x if x.is_contiguous() and not x.storage_offset() else x.clone() for x in inputs)
+            plain = (
+                x if x.is_contiguous() and not x.storage_offset() else x.clone(memory_format=torch.contiguous_format)
+                for x in inputs
+            )
             return tuple(function(*plain))
 
     return play

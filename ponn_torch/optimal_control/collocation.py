@@ -355,7 +355,7 @@ class Collocation:
 
     def _replayed(self, name: str, function: Callable[[], tuple[Tensor, ...]], xi: Tensor) -> tuple[Tensor, ...]:
         """What the function of ξ and this collocation gives, from a tape where it has been asked for often."""
-        if not recordable(xi, *self.setting.parameters.values()):
+        if not recordable(xi, *self._varied):
             return function()
         replay = self.discretisation.replays[name, *self._structure, tuple(xi.shape)]
         return replay(function, xi, *self._varied)
@@ -424,7 +424,7 @@ class Collocation:
             return times[..., :0], times.new_zeros(*batch, 0, self.n_shared)
         value, (by_knots, by_times, by_multipliers) = row_gradients(self._extra_rows, knots, times, multipliers)
         by_free = [by_knots.flatten(-2)[..., self.free_knots], by_times[..., self.free_times], by_multipliers]
-        return value, torch.cat(by_free, -1).movedim(0, -2)
+        return value, torch.cat(by_free, -1).movedim(0, -2).contiguous()
 
     def blocks(self, residual: Tensor) -> Mapping[str, Tensor]:
         """Norm of each equation (...,) by name, from r (..., R): the chains' last entries, switching, terminal."""

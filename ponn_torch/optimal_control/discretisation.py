@@ -213,10 +213,14 @@ class Discretisation:
 def discretise(
     bvp: BoundaryValueProblem, basis: FreeFunction, nodes: NodeSet, form: Form, conditioning: str
 ) -> Discretisation:
-    """The same object for the same parts: tables and tapes of one solve serve the next."""
+    """The same object for the same parts: tables and tapes of one solve serve the next.
+
+    A basis whose weights were changed in place is another one.
+    """
     if isinstance(basis, LinearBasis) and not dict(basis.named_buffers()):
         basis = _made_once(type(basis), tuple(basis.arguments.items()))
-    return _discretise(bvp, basis, nodes, form, conditioning)
+    weights = tuple((id(x), x._version) for x in (*basis.parameters(), *basis.buffers()))
+    return _discretise(bvp, basis, nodes, form, conditioning, weights)
 
 
 @lru_cache(maxsize=64)
@@ -225,4 +229,13 @@ def _made_once(kind: type[LinearBasis], arguments: tuple[tuple[str, Any], ...]) 
     return kind(**dict(arguments))
 
 
-_discretise = lru_cache(maxsize=32)(Discretisation)
+@lru_cache(maxsize=32)
+def _discretise(
+    bvp: BoundaryValueProblem,
+    basis: FreeFunction,
+    nodes: NodeSet,
+    form: Form,
+    conditioning: str,
+    weights: tuple[tuple[int, int], ...],
+) -> Discretisation:
+    return Discretisation(bvp, basis, nodes, form, conditioning)

@@ -1,8 +1,8 @@
 """The exact Jacobian of a collocation residual, block by block.
 
-F is differentiated at the nodes only: vmapped vjp gives ∂F_i/∂w for the equations in use, and the expressions pull
-these cotangents back to weights and knots. Times enter by the chain rule through the half lengths. Nothing of the size
-of the whole Jacobian is differentiated, which is what makes it cheap.
+F is differentiated at the nodes only: one backward pass gives ∂F_i/∂w for the equations in use, and the expressions
+pull these cotangents back to weights and knots. Times enter by the chain rule through the half lengths. Nothing of the
+size of the whole Jacobian is differentiated, which is what makes it cheap.
 """
 
 from __future__ import annotations

@@ -266,8 +266,6 @@ class BoundaryValueProblem:
 # -- building --------------------------------------------------------------------------------------------------------
 
 
-@lru_cache(maxsize=16)
-@torch.no_grad()
 def pontryagin(
     problem: OptimalControlProblem,
     *,
@@ -278,7 +276,8 @@ def pontryagin(
 ) -> BoundaryValueProblem:
     """Derive the boundary value problem; ``mass_variable`` is one of MASS_VARIABLES, ``chains`` merges ṙ = v.
 
-    Asked for again it is the same object, with all that was tabulated and recorded on it.
+    Asked for again it is the same object, with all that was tabulated and recorded on it: the problem's functions must
+    go on to compute the same. What is to vary belongs into ``parameters``, or into another problem.
 
     ``auto`` takes the logarithm of a mass where the problem names one: it keeps the mass positive, which decides
     whether a random start converges (Earth–Mars: 16 of 16 against 9 of 16 with the mass itself).
@@ -286,6 +285,28 @@ def pontryagin(
     Raises:
         ValueError: unknown mass variable, or one asked of a problem that names no mass.
     """
+    # mappings can be changed in place
+    data = (
+        problem.initial,
+        problem.final,
+        problem.final_time,
+        problem.parameters,
+        problem.units,
+        problem.costate_units,
+    )
+    return _derive(problem, repr(data), mass_variable, chains, dtype, device)
+
+
+@lru_cache(maxsize=16)
+@torch.no_grad()
+def _derive(
+    problem: OptimalControlProblem,
+    data: str,
+    mass_variable: str,
+    chains: bool,
+    dtype: torch.dtype,
+    device: torch.device | str,
+) -> BoundaryValueProblem:
     if mass_variable not in MASS_VARIABLES:
         raise ValueError(f"mass_variable = {mass_variable!r}; {nearest(mass_variable, MASS_VARIABLES)}")
     if mass_variable == "auto":

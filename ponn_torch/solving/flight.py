@@ -90,6 +90,9 @@ def fly(
                 atol=ABSOLUTE_TOLERANCE,
             )
             while solver.status == "running":
+                if np.isnan(solver.h_abs):  # which SciPy would try to shrink for ever
+                    message = "the rates are not finite"
+                    break
                 solver.max_step = reach(solver.t)
                 message = solver.step() or ""
                 if solver.status == "failed" or not np.isfinite(solver.y).all() or len(times) > most_steps:

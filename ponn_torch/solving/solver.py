@@ -355,9 +355,8 @@ class _Run:
                 message = "no stage solves its own problem between the nodes; the first one is kept"
             if change < 1e-6 * float(xi.abs().max()):
                 return Outcome.UNCHANGED
-            two = trusted and self._reads_arcs and self._smoothable and len(kept) > 1
-            if two and legible(solution.curve, kept[-2].curve):
-                return Outcome.LEGIBLE
+            if trusted and self._reads_arcs and (blunter := self._blunter(kept)):
+                return Outcome.LEGIBLE if legible(solution.curve, blunter) else Outcome.SOLVED
             return Outcome.SOLVED if trusted else Outcome.UNTRUSTED
 
         solver.continuation.run(attempt)
@@ -382,6 +381,11 @@ class _Run:
             return True
         return solution.off_node_residual <= self.solver.trust * solution.curve.largest_rate
 
+    def _blunter(self, stages: Sequence[Solution]) -> Curve | None:
+        """The stage before the last, if it was smoothed more."""
+        curves = [stage.curve for stage in stages[-2:]]
+        return curves[0] if curves[0].smoothing > curves[-1].smoothing else None
+
     # -- refinement ---------------------------------------------------------------------------------------------------
 
     def _refined(self, stages: Sequence[Solution]) -> tuple[Solution, str]:
@@ -391,8 +395,7 @@ class _Run:
             return smoothed, ""
         name = type(refinement).__name__.lower()
         self.observer.stage_started(name, None, len(self.stages))
-        blunter = stages[-2].curve if len(stages) > 1 and self._smoothable else None
-        refined = refinement.run(smoothed.curve, self._callback, blunter)
+        refined = refinement.run(smoothed.curve, self._callback, self._blunter(stages))
         improved = refined.curve is not smoothed.curve
         for result in refined.rounds:
             if not improved or result is not refined.result:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 import torch
 from helpers import random, relative
@@ -9,7 +11,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
 
+from ponn_torch.numerics import linalg
 from ponn_torch.numerics.linalg import LINEAR_SOLVERS, ArrowJacobian, DenseJacobian, Jacobian
+from ponn_torch.numerics.tape import RECORDING_PAYS
 
 
 def dense(batch: tuple[int, ...] = (), rows: int = 12, columns: int = 7, seed: int = 0) -> DenseJacobian:
@@ -160,6 +164,27 @@ def test_with_more_unknowns_than_equations_little_damping_meets_them_all_by_the_
     step = jacobian.solve_damped(residual, torch.tensor(1e-26, dtype=torch.float64), scale, "qr")
     assert relative(matrix @ step, -residual) < 1e-12
     assert relative(scale * step, -torch.linalg.pinv(matrix / scale) @ residual) < 1e-11
+
+
+@pytest.mark.parametrize("batch", [(), (3,)])
+def test_steps_from_a_tape_are_the_same_to_the_bit(batch):
+    """All Jacobians of one shape share a tape; what lies otherwise in memory is not played."""
+    before = linalg._replay.cache_info().currsize
+    for seed in range(RECORDING_PAYS + 3):
+        jacobian = arrow(batch, n_extra=3, seed=100 * seed)
+        residual, damping, scale = data(jacobian, batch)
+        norms, step = jacobian.column_norms(), jacobian.solve_damped(residual, damping, scale)
+        own, mixed, shared = jacobian._normal
+        plain = jacobian._step(own, mixed, shared, residual, damping[..., None, None], scale)
+        assert torch.equal(step, plain[0])
+        assert torch.equal(jacobian.gradient(residual), plain[1])
+        assert torch.equal(norms, jacobian._norms(own, shared)[0])
+    arrays = (jacobian.local, jacobian.shared, jacobian.extra, jacobian.index)
+    shapes = [x.shape for x in (*arrays, *jacobian._normal, residual, damping[..., None, None], scale)]
+    assert linalg._replay(ArrowJacobian._step, *shapes, residual.dtype, residual.device).recorded
+    assert linalg._replay.cache_info().currsize <= before + 2
+    permuted = replace(jacobian, local=jacobian.local.mT.contiguous().mT)
+    assert relative(permuted.solve_damped(residual, damping, scale), step) < 1e-11
 
 
 def test_an_arrow_without_coupling_is_block_diagonal():

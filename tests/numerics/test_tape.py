@@ -111,6 +111,16 @@ def test_a_tape_takes_views_for_inputs_and_leaves_them_alone() -> None:
     assert torch.equal(table, before)
 
 
+def test_a_tape_takes_inputs_of_any_layout() -> None:
+    def product(x: Tensor) -> Tensor:
+        return x.flatten() * x[1].repeat(3)
+
+    generator = torch.Generator().manual_seed(0)
+    x, y = (torch.randn(3, 5, generator=generator, dtype=torch.float64) for _ in range(2))
+    played = taped(product, x)
+    assert identical(played(y.mT.contiguous().mT), product(y))
+
+
 def test_nothing_is_computed_twice_or_for_nobody() -> None:
     def twice(t: Tensor, x: Tensor) -> Tensor:
         unused = torch.sin(x)

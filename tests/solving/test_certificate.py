@@ -226,6 +226,14 @@ def test_no_layer_is_flown_over(width):
     assert flight.y[-1, 0] == pytest.approx(exact, abs=1e-11)
 
 
+def test_a_flight_whose_rates_are_not_finite_ends_where_it_begins():
+    """From a first step of NaN SciPy would shrink it for ever."""
+    history = approximate(lambda t: np.zeros((len(t), 1)), 0.0, 1.0)
+    flight = fly(lambda t, y, k: np.full(1, np.nan), [0.0, 1.0], np.ones(1), [history])
+    assert not flight.arrived
+    assert flight.message == "the flight ended at 0.000 of the final time: the rates are not finite"
+
+
 def test_a_flight_into_a_singularity_ends_with_a_message():
     history = approximate(lambda t: np.zeros((len(t), 1)), 0.0, 2.0)
     flight = fly(lambda t, y, k: y * y, [0.0, 2.0], np.ones(1), [history], most_steps=300)

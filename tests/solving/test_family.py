@@ -45,6 +45,17 @@ def test_a_neighbour_is_the_solution_of_its_own_problem(solution):
     assert float(times[1]) == pytest.approx(cold.solution.switch_times[0], abs=1e-6)
 
 
+def test_on_the_same_segments_a_restart_needs_no_fit(solution, monkeypatch):
+    problem = landing(initial_position=(-880.0, 110.0, 1480.0))
+    family, solved = Family.of(solution.curve).restart(states(landing()))
+    assert solved.all()
+    fitted = family.restart(states(problem), at=1e-9)[0]  # another start of the time, so that it has to be fitted
+    monkeypatch.setattr("ponn_torch.solving.family.project", None)
+    found, solved = family.restart(states(problem))
+    assert solved.all()
+    torch.testing.assert_close(found.arc_times[:, 1:], fitted.arc_times[:, 1:], rtol=0, atol=1e-8)
+
+
 def test_the_rest_of_an_optimal_trajectory_is_optimal(solution):
     family, unit = Family.of(solution.curve), solution.bvp.time_unit
     for seconds, passed in ((4.0, 0), (15.0, 1)):

@@ -5,14 +5,14 @@ from __future__ import annotations
 import itertools
 import math
 import time
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cache
 
 import pytest
 import torch
 from helpers import PROBLEMS, PROBLEMS_WITH_ANSWERS, bvp_of, collocation, mass_variables, problem
 
-from ponn_torch.ansatz.basis import Chebyshev, Legendre
+from ponn_torch.ansatz.basis import Chebyshev, Legendre, RandomFeatures
 from ponn_torch.optim.base import Status, Stopping
 from ponn_torch.optim.least_squares import LevenbergMarquardt
 from ponn_torch.optimal_control.control_laws import Unconstrained
@@ -383,6 +383,33 @@ def test_the_cheapest_of_several_certified_extremals_is_kept():
     costs = [stage.cost / unit for stage in result.stages if stage.name == "split" and stage.cost > 0]
     assert max(costs) == pytest.approx(1.388, abs=1e-3)  # another extremal, just as well solved
     assert result.solution.cost / unit == pytest.approx(0.0142251748586, abs=1e-12)
+
+
+def test_a_solve_does_not_depend_on_those_before_it():
+    """Tables and tapes are kept from solve to solve, but not those of weights that were changed since."""
+    basis, fresh = RandomFeatures(30, "tanh"), RandomFeatures(30, "tanh", seed=7)
+    blunt = Solver(basis=basis, refinement=None, continuation=Ladder((1.0,)), n_starts=1)
+    for _ in range(3):
+        blunt.solve(problem("mars_landing"))
+    basis.load_state_dict(fresh.state_dict())
+    changed, alone = blunt.solve(problem("mars_landing")), replace(blunt, basis=fresh).solve(PROBLEMS["mars_landing"]())
+    assert torch.equal(changed.solution.curve.xi, alone.solution.curve.xi)
+    assert changed.stages[-1].norm == alone.stages[-1].norm
+
+
+def test_a_problem_that_was_changed_in_place_is_another_one():
+    made = PROBLEMS["energy_landing"]()
+    before = pontryagin(made)
+    assert pontryagin(made) is before
+    made.initial["v"] = [0.5 * value for value in made.initial["v"]]
+    assert not torch.equal(pontryagin(made).known_initial, before.known_initial)
+
+
+def test_a_ladder_in_another_parameter_than_the_smoothing_leads_to_the_optimum():
+    ladder = Ladder((60.0, 50.0, 44.823), parameter="final_time")
+    result = Solver(continuation=ladder, n_starts=1).solve(problem("mars_landing"))
+    assert result.certified
+    assert result.solution.cost == pytest.approx(268.0146563274, abs=1e-7)
 
 
 def test_a_seed_is_reproduced_bit_by_bit():
