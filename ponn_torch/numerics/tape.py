@@ -69,8 +69,9 @@ def taped(function: Callable[..., Tensor], *examples: Tensor) -> Callable[..., T
 
     The tape is held against the function near the examples too.
     """
+    plain = [x.clone(memory_format=torch.contiguous_format) for x in examples]
     try:
-        tape = Tape.record(lambda: (function(*examples),), examples)
+        tape = Tape.record(lambda: (function(*plain),), plain)
     except Unrecordable:
         return function
     elsewhere = [x * 1.01 if x.is_floating_point() else x for x in examples]
