@@ -200,7 +200,8 @@ def test_an_interrupted_monte_carlo_is_told_and_kept(tmp_path: Path, monkeypatch
     assert (fleet.completed, fleet.n_cycles) == (False, 2)
     lines = (tmp_path / "records.jsonl").read_text(encoding="utf-8").splitlines()
     assert [json.loads(line)["event"] for line in lines] == ["cycle"] * 5 + ["certificate", "failure"]
-    assert "Monte Carlo" not in (tmp_path / "report.md").read_text(encoding="utf-8")
+    assert outcome.message == "interrupted after 2 cycles of the Monte Carlo; what was flown is kept"
+    assert "3 vehicles" not in (tmp_path / "report.md").read_text(encoding="utf-8")
 
 
 def test_an_error_inside_leaves_its_reason(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

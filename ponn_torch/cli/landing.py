@@ -69,8 +69,9 @@ class Descent(Mission[PoweredDescent, Landing, LandingCertificate]):
             states, factors = dispersed(problem, self.how, self.n_vehicles, self.common.generator(1))
             how = replace(self.how, deadline=None)  # their plans are made together
             self.fleet = land(problem, planned.solution, states, factors, how=how, generator=self.common.generator(2))
-        if not self.flight.completed or (self.fleet is not None and not self.fleet.completed):
-            return self.interrupted(self.flight, recorder)
+        for flight in (self.flight, self.fleet):
+            if flight is not None and not flight.completed:
+                return self.interrupted(flight, recorder)
         certificate = certify_landing(self.flight, fuels, self.fleet, n_samples=self.n_samples, allowed=self.allowed)
         outcome = self.judged(certificate, recorder)
         if self.fleet is not None:

@@ -108,8 +108,10 @@ class Mission(ABC, Generic[P, F, C]):
         return self.flight if self.flight is not None and self.flight.n_cycles else None
 
     def interrupted(self, flight: F, recorder: FlightRecorder) -> Outcome:
+        """What an interruption of the nominal flight, or of the fleet, leaves."""
         recorder.failed("interrupted")
-        return Outcome(INTERRUPTED, f"interrupted after {flight.n_cycles} cycles; what was flown is kept")
+        of = " of the Monte Carlo" if flight is self.fleet else ""
+        return Outcome(INTERRUPTED, f"interrupted after {flight.n_cycles} cycles{of}; what was flown is kept")
 
     def judged(self, certificate: C, recorder: FlightRecorder) -> Outcome:
         """What the flight is worth, noted."""

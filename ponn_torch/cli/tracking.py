@@ -106,7 +106,7 @@ class Tracking(Mission[TrackingProblem, Flight, GuidanceCertificate]):
         if self.n_vehicles:
             self.fleet = self._dispersed(planner)
             if not self.fleet.completed:
-                return self.interrupted(self.flight, recorder)
+                return self.interrupted(self.fleet, recorder)
             self.summary = _summary(self.fleet)
             recorder.monte_carlo(self.summary)
         return outcome

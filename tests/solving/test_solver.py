@@ -450,18 +450,18 @@ def test_an_interrupted_solve_keeps_what_it_had(stage):
     assert result.solution is observer.reported is not None
 
 
-@pytest.mark.parametrize(("evaluations", "stages"), [(1, 1), (80, 3)])
-def test_a_budget_ends_a_solve_that_keeps_what_it_had(monkeypatch, evaluations, stages):
+@pytest.mark.parametrize(("reads", "stages"), [(1, 1), (80, 3)])
+def test_a_budget_ends_a_solve_that_keeps_what_it_had(monkeypatch, reads, stages):
     """By a clock that counts how often it is read, so that every machine spends it at the same place."""
     ticks = itertools.count()
     monkeypatch.setattr(time, "process_time", lambda: float(next(ticks)))
-    result = Solver(cpu_seconds=float(evaluations)).solve(problem("earth_mars"))
+    result = Solver(cpu_seconds=float(reads)).solve(problem("earth_mars"))
     assert not result.certified
     assert not result.interrupted
     assert result.stages[-1].status is Status.BUDGET
     assert Status.BUDGET.value in result.message
     assert result.solution is not None
-    assert result.cpu_seconds > evaluations
+    assert reads < result.cpu_seconds < reads + 20  # the iteration under way is ended
     assert len(result.stages) == stages
     assert (result.stages[0].n_iterations == 1) == (stages == 1)
 
