@@ -12,7 +12,7 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
-from ponn_torch.optim.base import Stopping
+from ponn_torch.optim.base import Status, Stopping
 from ponn_torch.optim.least_squares import LevenbergMarquardt
 from ponn_torch.optimal_control.collocation import Collocation, Unknowns
 from ponn_torch.optimal_control.control_laws import Minimiser, Regime
@@ -27,6 +27,9 @@ def _warm() -> LevenbergMarquardt:
     return LevenbergMarquardt(
         Stopping(tolerance=1e-9, decrease=1e-2, patience=2, max_iterations=12), damping=1e-8, ahead=True
     )
+
+
+SOON = 4  # iterations in which nearly all members are solved
 
 
 @dataclass(frozen=True)
@@ -157,9 +160,20 @@ class Family:
         else:
             guess = collocation.unpack(project(collocation, whole))
             xi = collocation.pack(replace(guess, multipliers=whole.unknowns.multipliers))
-        result = how.optimizer.run(collocation, xi)
-        found = Family(collocation, result.xi)
-        return found, (result.norm < how.segmentation.residual_tolerance) & (found.disagreement() < 1e-6)
+        found, norm = Family(collocation, xi)._solved(how.optimizer)
+        return found, (norm < how.segmentation.residual_tolerance) & (found.disagreement() < 1e-6)
+
+    def _solved(self, optimizer: LevenbergMarquardt) -> tuple[Family, Tensor]:
+        """The family with its equations solved as far as they go, and ‖r‖ (B,)."""
+        rule, soon = optimizer.stopping, min(SOON, optimizer.stopping.max_iterations)
+        first = replace(optimizer, stopping=replace(rule, max_iterations=soon))
+        result = first.run(self.collocation, self.xi)
+        xi, norm = result.xi, result.norm
+        late = torch.tensor([status is Status.MAX_ITERATIONS for status in result.member_status], device=xi.device)
+        if soon < rule.max_iterations and bool(late.any()):  # a few, that are not to keep the others
+            again = optimizer.run(self[late].collocation, xi[late])
+            xi, norm = xi.index_put((late,), again.xi), norm.index_put((late,), again.norm)
+        return Family(self.collocation, xi), norm
 
     def _lies_on(self, other: Collocation) -> bool:
         """Whether the other collocation has the segments of this family, so that its unknowns mean the same."""
