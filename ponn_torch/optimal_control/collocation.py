@@ -216,13 +216,15 @@ class Collocation:
         kappas, factors = self.kappas(unknowns, h)
         return self.discretisation.expressions.jets(unknowns.weights, kappas), kappas, factors
 
-    def points(self, jets: Sequence[Tensor], times: Tensor, h: Tensor) -> tuple[Tensor, Tensor]:
-        """(t (..., K, n, 1), w (..., K, n, 2n)) at the nodes."""
+    def points(
+        self, jets: Sequence[Tensor], times: Tensor, h: Tensor, z: Tensor | None = None
+    ) -> tuple[Tensor, Tensor]:
+        """(t (..., K, m, 1), w (..., K, m, 2n)) from the jets at z (m,) of every segment, by default the nodes."""
         pieces = []
         for group, jet in zip(self.discretisation.groups, jets, strict=True):
             for e in range(group.order):
                 pieces.append(jet[..., e, :] / (h[..., None] ** e * group.factors[:, e])[..., None])
-        t = times[..., :-1, None] + h[..., None] * (self.discretisation.nodes.points + 1.0)
+        t = times[..., :-1, None] + h[..., None] * ((self.discretisation.nodes.points if z is None else z) + 1.0)
         return t.unsqueeze(-1), self.discretisation.assemble(pieces)
 
     def on_each(self, unknowns: Unknowns, z: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -230,14 +232,10 @@ class Collocation:
         disc, times = self.discretisation, unknowns.times
         h = (times[..., 1:] - times[..., :-1]) / 2
         jets = disc.expressions.jets_at(z, unknowns.weights, self.kappas(unknowns, h)[0])
-        values, rates = [], []
-        for group, jet in zip(disc.groups, jets, strict=True):
-            for e in range(group.order):
-                scale = (h[..., None] ** e * group.factors[:, e])[..., None]
-                values.append(jet[..., e, :] / scale)
-                rates.append(jet[..., e + 1, :] / (h[..., None, None] * scale))
-        t = times[..., :-1, None] + h[..., None] * (z + 1.0)
-        return t, disc.assemble(values), disc.assemble(rates)
+        t, w = self.points(jets, times, h, z)
+        per_length = 1.0 / h[..., None, None]
+        rate = self.points([jet[..., 1:, :] * per_length[..., None] for jet in jets], times, h, z)[1]
+        return t.squeeze(-1), w, rate
 
     def along(self, unknowns: Unknowns, t: Tensor, segment: Tensor) -> Tensor:
         """w (..., m, 2n) at scaled times (..., m), each on a given segment (..., m)."""

@@ -363,11 +363,11 @@ class _Run:
         return kept, message
 
     def _coarse(self, result: OptimizeResult) -> bool:
-        """Whether a stage of large residual is best as it is: nothing is smoothed, and the iteration has settled.
+        """Whether a stage of large residual is best as it is: nothing is bounded, and the iteration has settled.
 
         Another start would settle at the same curve; more segments do not.
         """
-        return self.solver.exact and not self._smoothable and self.bvp.law.n_switching == 0 and result.status.stationary
+        return self.solver.exact and self.bvp.law.n_switching == 0 and result.status.stationary
 
     def _trusted(self, solution: Solution) -> bool:
         """Whether the stage's equations hold between the nodes too (a weak form claims its moments only).
