@@ -82,9 +82,8 @@ def pointwise_jacobian(
         value = function(*inputs, *fixed)
         if not value.requires_grad:  # F does not depend on its arguments at all
             return value[:n], tuple(x.new_zeros(n, count, x.shape[-1]) for x in arguments)
-        seeds = torch.zeros_like(value).view(count, n, -1)
-        seeds[range(count), :, list(rows)] = 1.0
-        pulled = torch.autograd.grad(value, inputs, seeds.view_as(value), materialize_grads=True)
+        seeds = torch.eye(value.shape[-1], dtype=value.dtype, device=value.device)[list(rows)]
+        pulled = torch.autograd.grad(value, inputs, seeds.repeat_interleave(n, 0), materialize_grads=True)
     return value.detach()[:n], tuple(x.view(count, n, -1).movedim(0, 1) for x in pulled)
 
 

@@ -29,14 +29,19 @@ def least_squares(matrix: Tensor, ridge: float = 0.0) -> Callable[[Tensor], Tens
     return lambda target: right.T @ (inverse[:, None] * (left.T @ target))
 
 
-def _cholesky_solve(matrix: Tensor, scale: Tensor, damping: Tensor, right: Tensor) -> Tensor:
-    """Solve (M + μ diag(scale²)) X = right by Cholesky of the scaled matrix; NaN where it is not positive definite."""
-    inverse = 1.0 / scale
-    scaled = matrix * inverse.unsqueeze(-1) * inverse.unsqueeze(-2)
+def _cholesky(matrix: Tensor, scale: Tensor, damping: Tensor) -> tuple[Tensor, Tensor]:
+    """(L, D⁻¹ (..., N, 1)) with D⁻¹ M D⁻¹ + μ = L Lᵀ, D = diag(scale); L is NaN where that is not positive definite."""
+    inverse = (1.0 / scale).unsqueeze(-1)
+    scaled = matrix * inverse * inverse.mT
     scaled.diagonal(dim1=-2, dim2=-1).add_(damping)
     factor, failed = torch.linalg.cholesky_ex(scaled)
-    solution = torch.cholesky_solve(right * inverse.unsqueeze(-1), factor) * inverse.unsqueeze(-1)
-    return torch.where((failed != 0)[..., None, None], torch.nan, solution)
+    return torch.where((failed != 0)[..., None, None], torch.nan, factor), inverse
+
+
+def _cholesky_solve(matrix: Tensor, scale: Tensor, damping: Tensor, right: Tensor) -> Tensor:
+    """Solve (M + μ diag(scale²)) X = right by Cholesky of the scaled matrix; NaN where it is not positive definite."""
+    factor, inverse = _cholesky(matrix, scale, damping)
+    return torch.cholesky_solve(right * inverse, factor) * inverse
 
 
 def _qr_tail(matrix: Tensor, scale: Tensor, damping: Tensor, n_lead: int) -> tuple[Tensor, Tensor]:
@@ -280,12 +285,16 @@ class ArrowJacobian:
         gradient = self._gradient(residual)
         scale_own, scale_shared = self._split_columns(scale)
         gradient_own, gradient_shared = self._split_columns(gradient)
-        solved = _cholesky_solve(own, scale_own, damping, torch.cat([mixed, gradient_own.unsqueeze(-1)], -1))
-        by_shared, by_residual = solved[..., :-1], solved[..., -1]
-        schur = self._scatter_matrix(shared - mixed.mT @ by_shared) + self.extra.mT @ self.extra
-        reduced = gradient_shared - self._scatter((mixed.mT @ by_residual.unsqueeze(-1)).squeeze(-1))
+        factor, inverse = _cholesky(own, scale_own, damping)
+        # L⁻¹ of both: what remains for the shared unknowns is symmetric to the last digit
+        coupled = torch.cat([mixed, gradient_own.unsqueeze(-1)], -1) * inverse
+        coupled = torch.linalg.solve_triangular(factor, coupled, upper=False)
+        by_shared, by_residual = coupled[..., :-1], coupled[..., -1:]
+        schur = self._scatter_matrix(shared - by_shared.mT @ by_shared) + self.extra.mT @ self.extra
+        reduced = gradient_shared - self._scatter((by_shared.mT @ by_residual).squeeze(-1))
         step = _cholesky_solve(schur, scale_shared, damping[..., 0], -reduced.unsqueeze(-1)).squeeze(-1)
-        inner = -by_residual - (by_shared @ self._gather(step).unsqueeze(-1)).squeeze(-1)
+        known = by_residual + by_shared @ self._gather(step).unsqueeze(-1)
+        inner = -(torch.linalg.solve_triangular(factor.mT, known, upper=True) * inverse).squeeze(-1)
         return torch.cat([inner.flatten(-2), step], -1), gradient
 
     def _by_qr(self, residual: Tensor, damping: Tensor, scale: Tensor) -> Tensor:

@@ -166,6 +166,8 @@ _FILLERS = {"zeros_like", "ones_like", "full_like", "new_zeros", "new_ones", "ne
 _BY_SHAPE = {"is_same_size", "_has_same_storage_numel"}
 # operations without a result, which raise an error where data are not what they should be
 _CHECKS = {"_linalg_check_errors"}
+# what leaves the other argument as it is, and in which places
+_NEUTRAL = {"mul": (1.0, (0, 1)), "div": (1.0, (1,)), "pow": (1.0, (1,)), "add": (0.0, (0, 1)), "sub": (0.0, (1,))}
 _BY_DATA = {torch.Tag.dynamic_output_shape, torch.Tag.data_dependent_output}
 
 
@@ -280,12 +282,17 @@ class _Writer:
             first = func._schema.arguments[0].alias_info
             if first is None or not first.is_write or storage(args[0]) not in self.made:
                 raise Unrecordable(f"{name} changes what it did not make")
+            onto_itself = name == "copy_" and self.names[id(args[0])] == self.names.get(id(args[1]))
+            if onto_itself or not args[0].numel() or any(x is args[0] for x in self._unchanged(name, args, kwargs)):
+                return
             text, reads = self._call(func, name, args, kwargs, read, bindings)
             self.steps.append(_Step(text, reads, [], self.root[self.names[id(args[0])]]))
             return
         own = not changed.isdisjoint(map(storage, out))
-        if not own and (not varies or name in _FILLERS):
+        if not own and (not varies or name in _FILLERS or self._vanishes(name, args)):
             return  # always the same: captured where it is read
+        if not own and any(self._goes_by(x, out[0], changed) for x in self._unchanged(name, args, kwargs)):
+            return
         sources = {storage(x) for x in read} & self.made.keys()
         if out and sources.issuperset(map(storage, out)):
             for x in out:
@@ -301,6 +308,36 @@ class _Writer:
         self.steps.append(_Step(text, reads, made, checks=name in _CHECKS))
         if not own and changed.isdisjoint(map(storage, read)):
             self.known[text] = made
+
+    def _fixed(self, x: Any, value: float) -> bool:
+        """Whether an argument is this number everywhere and always."""
+        if isinstance(x, Tensor):
+            return self.names.get(id(x)) not in self.root and bool((x == value).all())
+        return not isinstance(x, bool) and isinstance(x, int | float) and x == value
+
+    def _vanishes(self, name: str, args: Any) -> bool:
+        """Whether a result is zero, or one, whatever varies: that is taken to be finite."""
+        if name == "mul":
+            return self._fixed(args[0], 0.0) or self._fixed(args[1], 0.0)
+        if name == "where":
+            return self._fixed(args[1], 0.0) and self._fixed(args[2], 0.0)
+        return name == "pow" and self._fixed(args[1], 0.0)
+
+    def _unchanged(self, name: str, args: Any, kwargs: Any) -> list[Tensor]:
+        """Arguments that an operation leaves as they are, but for the sign of a zero: times one, plus zero."""
+        neutral, places = _NEUTRAL.get(name.removesuffix("_"), (0.0, ()))
+        return [args[1 - i] for i in places if not kwargs and self._fixed(args[i], neutral)]
+
+    def _goes_by(self, x: Any, out: Tensor, changed: set[int]) -> bool:
+        """Give a result the name of an argument that it is equal to, if views of one are views of the other."""
+        if not isinstance(x, Tensor) or (x.dtype, x.shape, x.stride()) != (out.dtype, out.shape, out.stride()):
+            return False
+        known = self.names[id(x)]
+        if self.root[known] != known or self.storages.of(x) in changed:
+            return False
+        self.names[id(out)] = known
+        self.made[self.storages.of(out)] = known, out
+        return True
 
     def _call(
         self, func: Any, name: str, args: Any, kwargs: Any, read: Sequence[Tensor], bindings: bool

@@ -7,7 +7,7 @@ saved state takes the very steps that it would have taken.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Protocol, TypeVar, cast
 
@@ -252,19 +252,10 @@ def _advance(
         best = torch.where(accepted, cost, best)
     norm = best.sqrt()
     slow = torch.where(move.decrease < rule.decrease, progress.slow + 1, torch.where(accepted, 0, progress.slow))
-    always = torch.ones_like(accepted)
-    code = progress.code
-    for status, where in (
-        (Status.RESIDUAL, (norm < rule.tolerance) & (not rule.past_tolerance)),
-        (Status.ROUND_OFF, ~accepted & (norm < rule.tolerance) & rule.past_tolerance),
-        (Status.SMALL_DECREASE, slow >= rule.patience),
-        (Status.SMALL_STEP, accepted & (move.step < rule.step)),
-        *move.ended.items(),
-        (Status.HOPELESS, (norm > rule.hopeless) & (iteration >= rule.hopeless_after)),
-        (Status.MAX_ITERATIONS, always & (iteration >= rule.max_iterations)),
-        (Status.TIME_LIMIT, always & (seconds > rule.cpu_seconds)),
-    ):
-        code = torch.where((code == RUNNING) & where, _CODES.index(status), code)
+    ended = torch.full_like(progress.code, RUNNING)
+    for status, where in _endings(rule, iteration, seconds, norm, slow, accepted, running, move):
+        ended = torch.where((ended == RUNNING) & where, _CODES.index(status), ended)
+    code = torch.where(progress.code == RUNNING, ended, progress.code)
 
     def middle(values: Tensor) -> Tensor:
         return values.nanmedian() if values.dim() else values
@@ -281,6 +272,33 @@ def _advance(
         seconds=seconds,
     )
     return _Progress(xi, r, best, code, slow, progress.records, seconds), entry
+
+
+def _endings(
+    rule: Stopping,
+    iteration: int,
+    seconds: float,
+    norm: Tensor,
+    slow: Tensor,
+    accepted: Tensor,
+    running: Tensor,
+    move: Move,
+) -> Iterator[tuple[Status, Tensor]]:
+    """Who ends and why, the first reason first."""
+    if rule.past_tolerance:
+        yield Status.ROUND_OFF, ~accepted & (norm < rule.tolerance)
+    else:
+        yield Status.RESIDUAL, norm < rule.tolerance
+    yield Status.SMALL_DECREASE, slow >= rule.patience
+    if rule.step:
+        yield Status.SMALL_STEP, accepted & (move.step < rule.step)
+    yield from move.ended.items()
+    if iteration >= rule.hopeless_after:
+        yield Status.HOPELESS, norm > rule.hopeless
+    if iteration >= rule.max_iterations:
+        yield Status.MAX_ITERATIONS, running
+    if seconds > rule.cpu_seconds:
+        yield Status.TIME_LIMIT, running
 
 
 def common(members: tuple[Status, ...]) -> Status:

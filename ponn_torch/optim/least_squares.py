@@ -63,15 +63,19 @@ AHEAD = 0.1  # of a step, where the curvature along it is read off
 
 @dataclass(frozen=True)
 class DampedState:
-    """Where Levenberg–Marquardt stands: ξ, r there, D, μ and its growth, and (r, J) if a rejected step left it."""
+    """Where Levenberg–Marquardt stands: ξ, r there, D, μ and its growth, and the next step's Jacobian if there is one.
+
+    formed_at: where that Jacobian was formed. contraction: ‖r‖ after over before, of the last step taken.
+    """
 
     xi: Tensor
     r: Tensor
     scale: Tensor
     damping: Tensor
     growth: Tensor
-    formed: bool = False
-    linear: tuple[Tensor, Jacobian] | None = None
+    contraction: Tensor
+    formed_at: Tensor | None = None
+    jacobian: Jacobian | None = None
 
 
 @dataclass(frozen=True)
@@ -86,6 +90,8 @@ class LevenbergMarquardt(Driven):
             residual and solve a step, for residuals that curve in their unknowns, as a deep network's do.
         ahead: form the Jacobian with the residual of a trial step (of one problem, not a batch). It pays where the two
             cost little more than the residual alone and most steps are taken.
+        reuse: take the next step with the same Jacobian too while steps make ‖r‖ fall to this share or below; there the
+            method is the simplified Newton method, whose steps cost a residual and two triangular solves.
     """
 
     stopping: Stopping = field(default_factory=Stopping)
@@ -97,6 +103,7 @@ class LevenbergMarquardt(Driven):
     largest_damping: float = 1e12
     geodesic: bool = False
     ahead: bool = False
+    reuse: float = 0.0
 
     def __post_init__(self) -> None:
         _check_solver(self.linear_solver)
@@ -106,6 +113,8 @@ class LevenbergMarquardt(Driven):
             raise ValueError(f"update = {self.update!r}; allowed: 'nielsen' or a factor above 1")
         if not self.damping >= 0:
             raise ValueError(f"damping = {self.damping}; allowed: a number ≥ 0")
+        if not 0 <= self.reuse < 1:
+            raise ValueError(f"reuse = {self.reuse}; allowed: from 0 to below 1")
 
     def begin(self, residual: Counted, xi: Tensor) -> DampedState:
         r, jacobian = residual.linearise(xi)
@@ -116,39 +125,44 @@ class LevenbergMarquardt(Driven):
             scale=self._scale(jacobian, None),
             damping=torch.full_like(cost, self.damping),
             growth=torch.full_like(cost, 2.0),
-            formed=True,
-            linear=(r, jacobian),
+            contraction=torch.ones_like(cost),
+            formed_at=xi,
+            jacobian=jacobian,
         )
 
     def restore(self, residual: Counted, arrays: Arrays, like: Tensor) -> DampedState:
         state: DampedState = restored(DampedState, arrays, like)
-        return replace(state, linear=residual.linearise(state.xi)) if state.formed else state
+        return state if state.formed_at is None else replace(state, jacobian=residual.linearise(state.formed_at)[1])
 
     def step(self, residual: Counted, state: DampedState, running: Tensor) -> tuple[DampedState, Move]:
-        xi, scale, damping, growth = state.xi, state.scale, state.damping, state.growth
-        if state.linear is not None:
-            r, jacobian = state.linear
-        else:
-            r, jacobian = residual.linearise(xi)
+        xi, r, scale = state.xi, state.r, state.scale
+        formed_at, jacobian = state.formed_at, state.jacobian
+        if jacobian is None:
+            jacobian, formed_at = residual.linearise(xi)[1], xi
             scale = self._scale(jacobian, scale)
-        cost, tiny = state.r.square().sum(-1), torch.finfo(xi.dtype).tiny
-        step = jacobian.solve_damped(r, damping, scale, self.linear_solver)
+        cost, tiny = r.square().sum(-1), torch.finfo(xi.dtype).tiny
+        step = jacobian.solve_damped(r, state.damping, scale, self.linear_solver)
         trial = xi + step
         if self.geodesic:
             ahead = residual.residual(xi + AHEAD * step)
             # J a = −r_vv, the second derivative of r along the step v
             curvature = (2 / AHEAD) * ((ahead - r) / AHEAD - jacobian.apply(step))
-            half = jacobian.solve_damped(0.5 * curvature, damping, scale, self.linear_solver)
+            half = jacobian.solve_damped(0.5 * curvature, state.damping, scale, self.linear_solver)
             short = 2 * (scale * half).norm(dim=-1) <= 0.75 * (scale * step).norm(dim=-1)  # NaN is not short
             trial = trial + torch.where(short.unsqueeze(-1), half, 0.0)
-        linear = residual.linearise_ahead(trial) if self.ahead and cost.numel() == 1 else None
-        trial_r = residual.residual(trial) if linear is None else linear[0]
+        fresh = formed_at is not None and torch.equal(formed_at, xi)
+        # close to a solution Newton's contraction is squared from step to step, that of an old Jacobian stays
+        promised = state.contraction**2 if fresh else state.contraction
+        if self.ahead and cost.numel() == 1 and not bool(promised <= self.reuse):
+            trial_r, following = residual.linearise_ahead(trial)
+        else:
+            trial_r, following = residual.residual(trial), None
         trial_cost = trial_r.square().sum(-1)
         accepted = running & (trial_cost < cost)  # NaN compares false: a non-finite step is rejected
         # ‖r‖² − ‖r + J p‖² for the exact solution of the damped system
-        predicted = (step * (damping.unsqueeze(-1) * scale.square() * step - jacobian.gradient(r))).sum(-1)
+        predicted = (step * (state.damping.unsqueeze(-1) * scale.square() * step - jacobian.gradient(r))).sum(-1)
         gain = (cost - trial_cost) / predicted.clamp_min(tiny)
-        damping, growth = self._update(damping, growth, gain, accepted, running)
+        damping, growth = self._update(state.damping, state.growth, gain, accepted, running)
         move = Move(
             # a rejected step that promised next to nothing is as good as a small decrease: round-off is near
             decrease=torch.where(accepted, cost - trial_cost, predicted) / cost,
@@ -159,13 +173,17 @@ class LevenbergMarquardt(Driven):
                 Status.DAMPING: ~accepted & (damping >= self.largest_damping),
             },
         )
+        contraction = torch.where(accepted, (trial_cost / cost).sqrt(), 1.0)
         if not bool(accepted.any()):
-            return DampedState(xi, state.r, scale, damping, growth, True, (r, jacobian)), move
-        if linear is not None:
-            return DampedState(trial, trial_r, self._scale(linear[1], scale), damping, growth, True, linear), move
-        where = accepted.unsqueeze(-1)
-        xi, trial_r = torch.where(where, trial, xi), torch.where(where, trial_r, state.r)
-        return DampedState(xi, trial_r, scale, damping, growth), move
+            # a rejected step is tried again, shorter; with an old Jacobian it says nothing
+            kept = (formed_at, jacobian) if fresh else (None, None)
+        elif following is not None:
+            xi, r, kept, scale = trial, trial_r, (trial, following), self._scale(following, scale)
+        else:
+            where = accepted.unsqueeze(-1)
+            xi, r = torch.where(where, trial, xi), torch.where(where, trial_r, r)
+            kept = (formed_at, jacobian) if bool((contraction <= self.reuse)[running].all()) else (None, None)
+        return DampedState(xi, r, scale, damping, growth, contraction, *kept), move
 
     def _scale(self, jacobian: Jacobian, previous: Tensor | None) -> Tensor:
         norms = jacobian.column_norms()

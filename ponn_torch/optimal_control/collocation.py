@@ -181,8 +181,8 @@ class Collocation:
         anchors = self.known_times.expand(*batch, -1)
         if len(self.free_times):
             anchors = anchors.index_copy(-1, self.free_times, xi[..., knot_end:time_end])
-        start, end = self._anchors
-        times = anchors[..., start] + self._fractions * (anchors[..., end] - anchors[..., start])
+        start, end = anchors.index_select(-1, self._anchors.flatten()).chunk(2, -1)
+        times = start + self._fractions * (end - start)
         return Unknowns(weights, knots.unflatten(-1, (k + 1, self.bvp.dimension)), times, xi[..., time_end:])
 
     def pack(self, unknowns: Unknowns) -> Tensor:
@@ -222,7 +222,8 @@ class Collocation:
         """(t (..., K, m, 1), w (..., K, m, 2n)) from the jets at z (m,) of every segment, by default the nodes."""
         pieces = []
         for group, jet in zip(self.discretisation.groups, jets, strict=True):
-            for e in range(group.order):
+            pieces.append(jet[..., 0, :])
+            for e in range(1, group.order):
                 pieces.append(jet[..., e, :] / (h[..., None] ** e * group.factors[:, e])[..., None])
         t = times[..., :-1, None] + h[..., None] * ((self.discretisation.nodes.points if z is None else z) + 1.0)
         return t.unsqueeze(-1), self.discretisation.assemble(pieces)
@@ -291,7 +292,7 @@ class Collocation:
 
     def residual(self, xi: Tensor) -> Tensor:
         """r (..., R): the segments' equations, then switching rows S(t_k) = 0, then terminal rows."""
-        return self._replayed("residual", lambda: (self._residual(xi),), xi)[0]
+        return self.replayed("residual", lambda: (self._residual(xi),), xi)[0]
 
     def _residual(self, xi: Tensor) -> Tensor:
         unknowns = self.unpack(xi)
@@ -329,7 +330,7 @@ class Collocation:
                 return residual, arrow.dense()
             return residual, arrow.local, arrow.shared, arrow.extra
 
-        residual, *blocks = self._replayed("linearise", parts, xi)
+        residual, *blocks = self.replayed("linearise", parts, xi)
         if self.n_segments == 1:
             return residual, DenseJacobian(*blocks)
         local, shared, extra = blocks
@@ -342,16 +343,18 @@ class Collocation:
         """All data but ξ: collocations that differ in nothing else share their tapes."""
         regime = self.setting.regime
         data = (self.known_knots, self.known_times, self._fractions, regime.smoothing, regime.arcs)
-        return tuple(x for x in (*data, *self.setting.parameters.values()) if x is not None)
+        places = (self._anchors, self.free_times, self._switches) if len(self.free_times) else ()
+        return tuple(x for x in (*data, *places, *self.setting.parameters.values()) if x is not None)
 
     @cached_property
     def _structure(self) -> tuple[object, ...]:
         """What a tape is good for."""
-        known = tuple(self.free_knots.tolist()), tuple(self.free_times.tolist()), self.events
+        events = tuple(event for event in self.events if event is not None)
+        known = tuple(self.free_knots.tolist()), len(self.free_times), events
         regime = self.setting.regime.smoothing is None, self.setting.regime.arcs is None
         return (*known, *regime, *self.setting.parameters, *(tuple(x.shape) for x in self._varied))
 
-    def _replayed(self, name: str, function: Callable[[], tuple[Tensor, ...]], xi: Tensor) -> tuple[Tensor, ...]:
+    def replayed(self, name: str, function: Callable[[], tuple[Tensor, ...]], xi: Tensor) -> tuple[Tensor, ...]:
         """What the function of ξ and this collocation gives, from a tape where it has been asked for often."""
         if not recordable(xi, *self._varied):
             return function()
@@ -393,16 +396,20 @@ class Collocation:
         """Interior knots with a switching row."""
         return [i + 1 for i, event in enumerate(self.events) if event is not None]
 
+    @cached_property
+    def _switches(self) -> Tensor:
+        return torch.tensor(self.switch_knots, dtype=torch.long, device=self.known_times.device)
+
     @property
     def n_extra(self) -> int:
         return len(self.switch_knots) + self.bvp.n_terminal_rows
 
     def _extra_rows(self, knots: Tensor, times: Tensor, multipliers: Tensor) -> Tensor:
-        rows, switches = [], self.switch_knots
+        rows, switches = [], self._switches
         regime = self.setting.regime
-        if switches:
+        if len(switches):
             chosen = [event for event in self.events if event is not None]
-            t, w = times[..., switches].unsqueeze(-1), knots[..., switches, :]
+            t, w = times.index_select(-1, switches).unsqueeze(-1), knots.index_select(-2, switches)
             parameters = {k: v[..., None, None].expand(t.shape) for k, v in self.setting.parameters.items()}
             switching = self.bvp.switching(t, w, Setting(Regime(), parameters))
             rows.append(switching[..., range(len(chosen)), chosen])
@@ -421,7 +428,11 @@ class Collocation:
         if not self.n_extra:
             return times[..., :0], times.new_zeros(*batch, 0, self.n_shared)
         value, (by_knots, by_times, by_multipliers) = row_gradients(self._extra_rows, knots, times, multipliers)
-        by_free = [by_knots.flatten(-2)[..., self.free_knots], by_times[..., self.free_times], by_multipliers]
+        by_free = [
+            by_knots.flatten(-2).index_select(-1, self.free_knots),
+            by_times.index_select(-1, self.free_times),
+            by_multipliers,
+        ]
         return value, torch.cat(by_free, -1).movedim(0, -2).contiguous()
 
     def blocks(self, residual: Tensor) -> Mapping[str, Tensor]:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
+from copy import copy
 from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
 from typing import Any
@@ -22,6 +23,7 @@ from ponn_torch.numerics.nodes import NodeSet, legendre_moments
 from ponn_torch.numerics.tape import Replay
 from ponn_torch.optimal_control.deep_expressions import DeepExpressions
 from ponn_torch.optimal_control.expressions import Expressions, LinearExpressions
+from ponn_torch.optimal_control.meaning import Keyed
 from ponn_torch.optimal_control.pontryagin import BoundaryValueProblem, Chain
 
 # -- test functions: how the pointwise residual becomes rows ---------------------------------------------------------
@@ -114,6 +116,17 @@ class Discretisation:
     form: Form = field(default_factory=Strong)
     conditioning: str = "orthonormal"
     combinations: Mapping[int, Tensor] = field(default_factory=dict)
+
+    def between(self, bvp: BoundaryValueProblem) -> Discretisation:
+        """The same tables and tapes for another boundary value problem of the same ``equations``."""
+        if bvp is self.bvp:
+            return self
+        for name, member in vars(Discretisation).items():
+            if isinstance(member, cached_property):  # to be in the copy, it has to be there
+                getattr(self, name)
+        made = copy(self)
+        object.__setattr__(made, "bvp", bvp)
+        return made
 
     @cached_property
     def groups(self) -> tuple[Group, ...]:
@@ -213,14 +226,14 @@ class Discretisation:
 def discretise(
     bvp: BoundaryValueProblem, basis: FreeFunction, nodes: NodeSet, form: Form, conditioning: str
 ) -> Discretisation:
-    """The same object for the same parts: tables and tapes of one solve serve the next.
+    """Tables and tapes are the same for the same equations and parts: those of one solve serve the next.
 
     A basis whose weights were changed in place is another one.
     """
     if isinstance(basis, LinearBasis) and not dict(basis.named_buffers()):
         basis = _made_once(type(basis), tuple(basis.arguments.items()))
     weights = tuple((id(x), x._version) for x in (*basis.parameters(), *basis.buffers()))
-    return _discretise(bvp, basis, nodes, form, conditioning, weights)
+    return _discretise(Keyed(bvp.equations, bvp), basis, nodes, form, conditioning, weights).between(bvp)
 
 
 @lru_cache(maxsize=64)
@@ -231,11 +244,11 @@ def _made_once(kind: type[LinearBasis], arguments: tuple[tuple[str, Any], ...]) 
 
 @lru_cache(maxsize=32)
 def _discretise(
-    bvp: BoundaryValueProblem,
+    stated: Keyed[BoundaryValueProblem],
     basis: FreeFunction,
     nodes: NodeSet,
     form: Form,
     conditioning: str,
     weights: tuple[tuple[int, int], ...],
 ) -> Discretisation:
-    return Discretisation(bvp, basis, nodes, form, conditioning)
+    return Discretisation(stated.value, basis, nodes, form, conditioning)

@@ -52,11 +52,11 @@ def _weigh(collocation: Collocation, equations: Tensor, h: Tensor, local: Tensor
     for group in collocation.discretisation.groups:
         power = group.order - 1
         if power and len(collocation.free_times):
-            local[..., group.rows, :] /= stretch**power
-            shared[..., group.rows, :] /= stretch**power
+            local[..., group.rows, :].div_(stretch**power)
+            shared[..., group.rows, :].div_(stretch**power)
             # 2h is the distance between the anchors times g − f
             by_end = -0.5 * power * (g - f) * equations[..., group.rows, None] / length
-            shared[..., group.rows, -2:] += torch.cat([-by_end, by_end], -1)
+            shared[..., group.rows, -2:].add_(torch.cat([-by_end, by_end], -1))
 
 
 def _rates_and_slopes(collocation: Collocation, t: Tensor, w: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -88,8 +88,9 @@ def _by_half_length(
         powers = torch.arange(group.order, dtype=h.dtype, device=h.device).repeat(2)
         # κ_e carries h^e
         by_h = torch.einsum("onk,...dk->...don", group.Omega, powers * kappa) * per_length[..., None]
-        for e in range(group.order):
-            change = by_h[..., e, :] - e * per_length * jet[..., e, :] if e else by_h[..., 0, :]
+        moved.append(by_h[..., 0, :])
+        for e in range(1, group.order):
+            change = by_h[..., e, :] - e * per_length * jet[..., e, :]
             moved.append(change / (h[..., None] ** e * group.factors[:, e])[..., None])
         tops.append(by_h[..., -1, :])
     by_points = (by_w @ torch.cat(moved, -2).mT.unsqueeze(-1)).squeeze(-1)

@@ -8,7 +8,7 @@ to the constants c, so the costs, S and the control law stay those of the user's
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
 from typing import Any
@@ -18,6 +18,7 @@ from torch import Tensor
 
 from ponn_torch.numerics.autodiff import differentiable, gradients_and_values, pointwise_jacobian
 from ponn_torch.optimal_control.control_laws import INTERIOR, LOWER, UPPER, ControlSet, Minimiser, Regime
+from ponn_torch.optimal_control.meaning import Keyed, meaning
 from ponn_torch.optimal_control.problem import Named, OptimalControlProblem, nearest
 
 MASS_VARIABLES = ("auto", "mass", "log_mass", "delta_v")
@@ -67,6 +68,12 @@ class BoundaryValueProblem:
     known_final: Tensor
     n_multipliers: int = 0
     chains: tuple[Chain, ...] = ()
+
+    @cached_property
+    def equations(self) -> Hashable:
+        """Equal for boundary value problems that differ in nothing but values at the ends and of parameters."""
+        of_states = self.unit.dtype, self.unit.device, self.mass_variable
+        return _statement(self.problem), *of_states, meaning(self.law), meaning(self.chains)
 
     # -- scaling -----------------------------------------------------------------------------------------------
 
@@ -276,8 +283,8 @@ def pontryagin(
 ) -> BoundaryValueProblem:
     """Derive the boundary value problem; ``mass_variable`` is one of MASS_VARIABLES, ``chains`` merges ṙ = v.
 
-    Asked for again it is the same object, with all that was tabulated and recorded on it: the problem's functions must
-    go on to compute the same. What is to vary belongs into ``parameters``, or into another problem.
+    What is derived for a problem serves all that say the same but for their ends (``equations``): its functions must go
+    on to compute the same. What is to vary belongs into ``parameters``, or into another problem.
 
     ``auto`` takes the logarithm of a mass where the problem names one: it keeps the mass positive, which decides
     whether a random start converges (Earth–Mars: 16 of 16 against 9 of 16 with the mass itself).
@@ -285,28 +292,30 @@ def pontryagin(
     Raises:
         ValueError: unknown mass variable, or one asked of a problem that names no mass.
     """
-    # mappings can be changed in place
-    data = (
-        problem.initial,
-        problem.final,
-        problem.final_time,
-        problem.parameters,
-        problem.units,
-        problem.costate_units,
-    )
-    return _derive(problem, repr(data), mass_variable, chains, dtype, device)
+    stated = Keyed((_statement(problem), meaning(problem.parameters)), problem)
+    with torch.no_grad():
+        bvp = replace(_derive(stated, mass_variable, chains, dtype, device), problem=problem)
+        return replace(bvp, **_boundary(bvp))
+
+
+def _statement(problem: OptimalControlProblem) -> Hashable:
+    """All that the equations depend on but the values of parameters; of the ends and the final time, what is known."""
+    known = [[value is not None for value in problem.boundary(end)] for end in ("initial", "final")]
+    functions = (problem.dynamics, problem.running_cost, problem.terminal_cost, problem.terminal_manifold)
+    rest = (problem.states, problem.control, problem.mass, problem.exhaust_velocity, problem.free_final_time)
+    units = (problem.units, problem.costate_units, list(problem.parameters))
+    return meaning([*functions, *rest, *units, known])
 
 
 @lru_cache(maxsize=16)
-@torch.no_grad()
 def _derive(
-    problem: OptimalControlProblem,
-    data: str,
+    stated: Keyed[OptimalControlProblem],
     mass_variable: str,
     chains: bool,
     dtype: torch.dtype,
     device: torch.device | str,
 ) -> BoundaryValueProblem:
+    problem = stated.value
     if mass_variable not in MASS_VARIABLES:
         raise ValueError(f"mass_variable = {mass_variable!r}; {nearest(mass_variable, MASS_VARIABLES)}")
     if mass_variable == "auto":
@@ -337,9 +346,9 @@ def _derive(
         known_initial=tensor([]),
         known_final=tensor([]),
     )
-    bvp = replace(bvp, **_boundary(bvp), law=_adapted_law(bvp))
+    bvp = replace(bvp, law=_adapted_law(bvp), n_multipliers=_n_multipliers(bvp))
     bvp = replace(bvp, chains=find_chains(bvp) if chains else _single_chains(bvp))
-    tensors = ("unit", "exponent", "conjugate", "known_initial", "known_final")
+    tensors = ("unit", "exponent", "conjugate")
     return replace(bvp, **{name: getattr(bvp, name).to(dtype=dtype, device=device) for name in tensors})
 
 
@@ -362,12 +371,16 @@ def _boundary(bvp: BoundaryValueProblem) -> dict[str, Any]:
             else:
                 w[bvp.n_states + i] = torch.nan
         out[f"known_{end}"] = w
-    if problem.terminal_manifold is not None:
-        one = torch.ones_like(bvp.unit[:1]).expand(2, 1)
-        p = Named(**_parameters(bvp, one))
-        psi = problem.terminal_manifold(one, problem.named(bvp.unit.expand(2, -1)), p)
-        out["n_multipliers"] = psi.shape[-1]
     return out
+
+
+def _n_multipliers(bvp: BoundaryValueProblem) -> int:
+    """Components of the terminal manifold."""
+    if bvp.problem.terminal_manifold is None:
+        return 0
+    one = torch.ones_like(bvp.unit[:1]).expand(2, 1)
+    end = bvp.problem.named(bvp.unit.expand(2, -1))
+    return int(bvp.problem.terminal_manifold(one, end, Named(**_parameters(bvp, one))).shape[-1])
 
 
 def probe_points(bvp: BoundaryValueProblem, count: int, seed: int = 0) -> tuple[Tensor, Tensor]:

@@ -67,7 +67,8 @@ def mars_landing(
         known_cost = known_optimum(mars_landing, locals(), OPTIMA_KG, unused)
     cosine = math.cos(math.radians(cant_angle_degrees))
     alpha = mass_flow_per_thrust or 1.0 / (specific_impulse * standard_gravity * cosine)
-    length = max(math.hypot(*initial_position), 1.0)
+    # a power of two: landings from about as high up then have the same scaled equations, which are derived once
+    length = 2.0 ** round(math.log2(max(math.hypot(*initial_position), 1.0)))
     speed = length / final_time
 
     def dynamics(t: torch.Tensor, x: Named, u: Named, p: Named) -> dict[str, torch.Tensor]:

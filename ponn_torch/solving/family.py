@@ -20,12 +20,12 @@ from ponn_torch.optimal_control.curve import Curve
 from ponn_torch.optimal_control.discretisation import Discretisation
 from ponn_torch.optimal_control.pontryagin import Setting
 from ponn_torch.solving.guess import project
-from ponn_torch.solving.refinement import Segmentation
+from ponn_torch.solving.refinement import Segmentation, shared_out
 
 
 def _warm() -> LevenbergMarquardt:
     return LevenbergMarquardt(
-        Stopping(tolerance=1e-9, decrease=1e-2, patience=2, max_iterations=12), damping=1e-8, ahead=True
+        Stopping(tolerance=1e-9, decrease=1e-2, patience=2, max_iterations=12), damping=1e-8, ahead=True, reuse=0.01
     )
 
 
@@ -125,14 +125,19 @@ class Family:
         made, arcs = self.collocation, self.collocation.setting.regime.arcs
         if arcs is None:
             return self.xi.new_zeros(len(self))
-        t, w, _ = made.on_each(self.unknowns, made.discretisation.nodes.between(n_points))
-        segment = torch.arange(made.n_segments, device=t.device).expand(len(self), -1).repeat_interleave(t.shape[-1], 1)
-        t, w = t.flatten(1), w.flatten(1, 2)
-        switching = self._minimiser(t, w, None, segment).switching
-        wrong = made.bvp.law.arc_codes(switching) != arcs[segment.flatten()]
-        # S of a curved law comes in two halves, one per bound; the nearer of the two says how far
-        depth = torch.stack(switching.abs().chunk(2 if made.bvp.law.curved else 1, -1)).amin(0)
-        return torch.where(wrong, depth, torch.zeros_like(depth)).view(len(self), -1).amax(-1)
+
+        def depth() -> tuple[Tensor]:
+            t, w, _ = made.on_each(made.unpack(self.xi), made.discretisation.nodes.between(n_points))
+            segment = torch.arange(made.n_segments, device=t.device).repeat_interleave(t.shape[-1])
+            t, w = t.flatten(1), w.flatten(1, 2)
+            codes = arcs[segment].repeat(len(self), 1)
+            switching = self._minimiser(t, w, None, segment).switching
+            wrong = made.bvp.law.arc_codes(switching) != codes
+            # S of a curved law comes in two halves, one per bound; the nearer of the two says how far
+            how_far = torch.stack(switching.abs().chunk(2 if made.bvp.law.curved else 1, -1)).amin(0)
+            return (torch.where(wrong, how_far, torch.zeros_like(how_far)).view(len(self), -1).amax(-1),)
+
+        return made.replayed(f"disagreement at {n_points}", depth, self.xi)[0]
 
     # -- the same arcs from elsewhere ----------------------------------------------------------------------------------
 
@@ -185,8 +190,8 @@ class Family:
         """The arcs that lie ahead, cut into segments in the same way for all members."""
         made, bvp = self.collocation, self.collocation.bvp
         ends = torch.cat([start[:, None], self.arc_times[:, passed + 1 :]], -1)
-        share = (ends.diff(dim=-1) / (ends[:, -1:] - ends[:, :1])).mean(0) * segmentation.n_segments
-        counts = share.round().clamp_min(1).long().tolist()
+        share = (ends.diff(dim=-1) / (ends[:, -1:] - ends[:, :1])).mean(0)
+        counts = shared_out(share.tolist(), segmentation.n_segments)
         steps = [torch.arange(1, n + 1, dtype=ends.dtype, device=ends.device) / n for n in counts]
         cuts = [ends[:, i, None] + step * ends.diff(dim=-1)[:, i, None] for i, step in enumerate(steps)]
         times = torch.cat([ends[:, :1], *cuts], -1)

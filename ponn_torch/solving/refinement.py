@@ -7,7 +7,7 @@ the smoothing behind.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from enum import Enum
 from typing import ClassVar, Protocol
@@ -164,6 +164,15 @@ class Segments:
             if i + 1 < k:
                 events.append(self.events[i])
         return Segments(torch.stack(times), tuple(events), torch.stack(codes))
+
+
+def shared_out(lengths: Sequence[float], n_segments: int) -> list[int]:
+    """Segments for every arc, at least one and n_segments in all, so that the longest segment is as short as can be."""
+    counts = [1] * len(lengths)
+    for _ in range(n_segments - len(lengths)):
+        longest = max(range(len(lengths)), key=lambda i: lengths[i] / counts[i])
+        counts[longest] += 1
+    return counts
 
 
 @dataclass(frozen=True)

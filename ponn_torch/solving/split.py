@@ -23,7 +23,7 @@ from ponn_torch.optimal_control.curve import Curve
 from ponn_torch.optimal_control.discretisation import Discretisation
 from ponn_torch.optimal_control.pontryagin import Setting
 from ponn_torch.optimal_control.problem import DisplayUnit
-from ponn_torch.solving.refinement import MakeCallback, Outcome, Refined, Segmentation, Segments
+from ponn_torch.solving.refinement import MakeCallback, Outcome, Refined, Segmentation, Segments, shared_out
 from ponn_torch.solving.sharpening import graded_times, singular_interval, undecided
 from ponn_torch.solving.switching import (
     Structure,
@@ -181,10 +181,9 @@ class Split(Segmentation):
 
 
 def _spread(structure: Structure, times: Tensor, n_segments: int) -> Segments:
-    """Cut every arc into equal segments, about n_segments in all, more where an arc is longer."""
+    """Cut every arc into equal segments, n_segments in all where there are no more arcs."""
     ends = torch.cat([times[:1], structure.times, times[-1:]])
-    share = (ends[1:] - ends[:-1]) / (ends[-1] - ends[0]) * n_segments
-    counts = share.round().clamp_min(1).long().tolist()
+    counts = shared_out(ends.diff().tolist(), n_segments)
     knots, codes = [ends[:1]], []
     events: list[int | None] = []
     for i, count in enumerate(counts):

@@ -126,11 +126,43 @@ def test_nothing_is_computed_twice_or_for_nobody() -> None:
     def twice(t: Tensor, x: Tensor) -> Tensor:
         unused = torch.sin(x)
         del unused
-        return torch.cat([torch.exp(x * torch.ones_like(x)), torch.exp(x * torch.ones_like(x))])
+        return torch.cat([torch.exp(x * torch.full_like(x, 2.0)), torch.exp(x * torch.full_like(x, 2.0))])
 
     t, x = points()[0]
     tape = Tape.record(lambda: (twice(t, x),), (t, x))
     assert tape.n_operations == 3  # the product, its exponential, the concatenation
+
+
+def test_what_changes_nothing_or_always_vanishes_is_left_out() -> None:
+    def function(t: Tensor, x: Tensor) -> Tensor:
+        one, nothing = torch.ones_like(x), torch.zeros_like(x)
+        same = (1.0 * x * one + nothing) / one - nothing
+        vanishing = torch.where(x > 0.3, nothing * torch.sin(x), nothing) + same**0 - one
+        made = torch.sin(same + vanishing * t)
+        made.mul_(one)
+        made[:0] += t[:0]
+        return made
+
+    t, x = points()[0]
+    tape = Tape.record(lambda: (function(t, x),), (t, x))
+    assert tape.n_operations == 1  # the sine
+    for t, x in points():
+        assert torch.equal(tape.play(t, x)[0], function(t, x))
+
+
+def test_a_view_is_not_taken_for_what_it_is_multiplied_to() -> None:
+    """The product with ones is laid out anew, so that views of it are others than views of the factor."""
+
+    def function(t: Tensor, x: Tensor) -> Tensor:
+        square = torch.outer(x.flatten(), t.flatten())
+        turned = square.mT * torch.ones_like(square.mT)
+        part = (square[1:] * torch.ones_like(square[1:]))[1:, :2]
+        return torch.cat([turned.contiguous().view(-1)[::3], part.reshape(-1)])
+
+    played = taped(function, *points()[0])
+    assert played is not function
+    for t, x in points():
+        assert torch.equal(played(t, x), function(t, x))
 
 
 def test_results_are_not_shared_between_plays() -> None:

@@ -23,6 +23,7 @@ RESUMABLE = {
     "levenberg_marquardt": LevenbergMarquardt(STOPPING),
     "levenberg_marquardt_more": LevenbergMarquardt(STOPPING, scaling="more"),
     "levenberg_marquardt_identity": LevenbergMarquardt(STOPPING, scaling="identity", update=3.0),
+    "levenberg_marquardt_reuse": LevenbergMarquardt(STOPPING, reuse=0.3),
     "adam_cosine": Adam(STOPPING),
     "adam_exponential": Adam(STOPPING, schedule="exponential"),
     "lbfgs": LBFGS(STOPPING, memory=5),

@@ -241,6 +241,30 @@ def test_a_jacobian_formed_ahead_changes_no_step(name):
     assert torch.equal(batches[0].xi, batches[1].xi)
 
 
+@pytest.mark.parametrize("ahead", [False, True])
+def test_a_jacobian_is_used_again_where_steps_contract(ahead):
+    """The same solution, with fewer Jacobians; every step still falls."""
+    residual, start = Pointwise(lambda x: x + 0.4 * torch.sin(MATRIX[:2] @ x) - 1.0), torch.ones(2, dtype=torch.float64)
+    newton, simplified = (
+        LevenbergMarquardt(Stopping(tolerance=1e-12), damping=1e-10, ahead=ahead, reuse=reuse).run(residual, start)
+        for reuse in (0.0, 0.2)
+    )
+    assert newton.status is simplified.status is Status.RESIDUAL
+    assert (simplified.xi - newton.xi).abs().max() < 1e-11
+    assert simplified.n_linearisations < newton.n_linearisations
+    norms = [record["norm"] for record in simplified.records]
+    assert norms == sorted(norms, reverse=True)
+
+
+@pytest.mark.parametrize("start", [[0.3], [1.2], [0.1, -1.3, 0.7]])
+def test_an_old_jacobian_that_does_not_help_is_formed_anew(start):
+    """Where Newton's step nearly overshoots the next one with the same slope would go back and forth."""
+    xi = torch.tensor(start, dtype=torch.float64)[:, None]
+    result = LevenbergMarquardt(Stopping(tolerance=1e-12), damping=1e-12, reuse=0.9).run(_ArcTangent(), xi)
+    assert result.status is Status.RESIDUAL
+    assert bool((result.xi.abs() < 1e-12).all())
+
+
 def test_iteration_limit():
     residual, start = start_of("rosenbrock")
     result = LevenbergMarquardt(Stopping(max_iterations=3)).run(residual, start)
@@ -514,6 +538,7 @@ def test_scipy_takes_one_problem_at_a_time():
         (lambda: LevenbergMarquardt(update="fast"), "update = 'fast'; allowed"),
         (lambda: LevenbergMarquardt(damping=-1.0), "damping = -1.0; allowed: a number ≥ 0"),
         (lambda: LevenbergMarquardt(damping=float("nan")), "damping = nan"),
+        (lambda: LevenbergMarquardt(reuse=1.0), "reuse = 1.0; allowed: from 0 to below 1"),
         (lambda: GaussNewton(linear_solver="svd"), "linear_solver = 'svd'"),
         (lambda: ScipyLeastSquares("bfgs"), "method = 'bfgs'; allowed: trf, lm, dogbox"),
     ],
