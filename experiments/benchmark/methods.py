@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import statistics
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from typing import Any
 
 from experiments.benchmark.timing import WARM_UP
@@ -33,11 +34,20 @@ FIRST: dict[str, Unstructured] = {"earth_mars": Unstructured(80, guess=PolarTran
 STAGES: dict[str, int] = {"earth_mars": 20}  # segments of the second stage
 
 
-def _indirect(solver: Solver, make: Callable[[], OptimalControlProblem] | None = None) -> Run:
-    """Seeds of one problem, or each a problem of its own, of which nothing is known from a solve before."""
+def _unseen(problem: OptimalControlProblem) -> OptimalControlProblem:
+    """The same, in a function that no solve before can have met."""
+
+    def dynamics(*arguments: Any, new: object = object()) -> Any:
+        return problem.dynamics(*arguments)
+
+    return replace(problem, dynamics=dynamics)
+
+
+def _indirect(solver: Solver, first: bool = False) -> Run:
+    """Seeds of one problem; each the ``first`` of its kind, of which nothing is known from a solve before."""
 
     def run(problem: OptimalControlProblem, seed: int) -> dict[str, Any]:
-        result = solver.solve(make() if make else problem, seed)
+        result = solver.solve(_unseen(problem) if first else problem, seed)
         refinement = [stage for stage in result.stages if stage.name != "smooth"]
         return {
             "solved": result.certified,
@@ -67,7 +77,7 @@ def _methods(name: str) -> Mapping[str, Run]:
     first = FIRST.get(name, Unstructured())
     return {
         "ponn-torch": _indirect(Solver()),
-        "ponn-torch, first solve": _indirect(Solver(), PROBLEMS[name]),
+        "ponn-torch, first solve": _indirect(Solver(), first=True),
         "the same with two loops": _indirect(Solver(refinement=TwoLoop())),
         "CasADi unstructured": _direct(first),
         "CasADi two-stage": _direct(TwoStage(first, n_segments=STAGES.get(name, 8))),

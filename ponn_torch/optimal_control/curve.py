@@ -79,8 +79,15 @@ class Curve:
 
     def defect(self, n_points: int = 200) -> tuple[Tensor, Tensor]:
         """ẇ − F at scaled times off the nodes, about n_points a segment: (t (K·n,), (K·n, 2n))."""
-        t, w, rate, segment = self.on_segments(self.collocation.discretisation.nodes.between(n_points))
-        return t, rate - self.collocation.bvp.rates(t[:, None], w, self.setting(segment))
+        made = self.collocation
+
+        def values() -> tuple[Tensor, ...]:
+            fresh = Curve(made, self.xi)  # whose unknowns are read off ξ here
+            t, w, rate, segment = fresh.on_segments(made.discretisation.nodes.between(n_points))
+            return t, rate - made.bvp.rates(t[:, None], w, fresh.setting(segment))
+
+        t, defect = made.replayed(f"defect at {n_points}", values, self.xi)
+        return t, defect
 
     def off_node_residuals(self, n_points: int = 50) -> Tensor:
         """Largest |ẇ − F| off the nodes of every segment (K,), in scaled units."""

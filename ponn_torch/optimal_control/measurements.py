@@ -134,7 +134,7 @@ def _components(problem: OptimalControlProblem) -> dict[str, tuple[str, DisplayU
 class Measured:
     """A collocation residual with the rows of measurements; ξ (N,), one problem.
 
-    Every segment has as many further rows as the fullest one has measurements, zeros where there is none.
+    Every segment has a further row for every measurement, zero where that lies in another one.
 
     Raises:
         ValueError: a name that is no component of states or costates, or no time within the flight.
@@ -179,61 +179,50 @@ class Measured:
     def linear_unknowns(self) -> Tensor:
         return self.collocation.linear_unknowns
 
-    def _place(self, xi: Tensor) -> tuple[list[Tensor], int]:
-        """Rows of every segment, and the largest number of them; times after the end count at the end."""
+    def _segments(self, xi: Tensor) -> Tensor:
+        """The segment (M,) of every row; times after the end count at the end."""
         times = self.collocation.unpack(xi.detach()).times
-        index = torch.searchsorted(times[1:-1].contiguous(), self._rows[0], right=True)
-        rows = [(index == k).nonzero()[:, 0] for k in range(self.collocation.n_segments)]
-        return rows, len(self._rows[0])
+        return torch.searchsorted(times[1:-1].contiguous(), self._rows[0], right=True)
 
-    def _deviations(self, xi: Tensor, rows: list[Tensor]) -> list[Tensor]:
-        """√w (x − y) of every segment's rows, scaled."""
-        curve, out = Curve(self.collocation, xi), []
-        t, column, y, root = self._rows
-        for k, which in enumerate(rows):
-            start, end = curve.times[k], curve.times[k + 1]
-            z = (2 * (t[which] - start) / (end - start) - 1).clamp(-1, 1)
-            w = curve.on_segment(z, k)[1]
-            physical = torch.cat(self.collocation.bvp.to_physical(w), -1) / self._sizes
-            x = physical.gather(-1, column[which, None])[:, 0]
-            out.append(root[which] * (x - y[which]))
-        return out
+    def _deviations(self, xi: Tensor, segment: Tensor) -> Tensor:
+        """√w (x − y) (M,), scaled."""
+        curve, (t, column, y, root) = Curve(self.collocation, xi), self._rows
+        inside = torch.minimum(torch.maximum(t, curve.times[segment]), curve.times[segment + 1])
+        physical = torch.cat(self.collocation.bvp.to_physical(curve.at(inside, segment)), -1) / self._sizes
+        return root * (physical.gather(-1, column[:, None])[:, 0] - y)
 
     def residual(self, xi: Tensor) -> Tensor:
         """r of the equations, every segment's followed by its measurements', then the rows that segments share."""
-        rows, width = self._place(xi)
-        return self._merge(self.collocation.residual(xi), self._deviations(xi, rows), width)
+        segment = self._segments(xi)
+        return self._merge(self.collocation.residual(xi), self._deviations(xi, segment), segment)
 
     def linearise(self, xi: Tensor) -> tuple[Tensor, ArrowJacobian]:
         """(r, J); rows of measurements by reverse mode through the expression at their times."""
-        rows, width = self._place(xi)
+        segment = self._segments(xi)
         r, jacobian = linearise(self.collocation, xi)
         point = xi.detach().requires_grad_()
         with torch.enable_grad():
-            deviations = self._deviations(point, rows)
-            together = torch.cat(deviations)
-        seeds = torch.eye(len(together), dtype=xi.dtype, device=xi.device)
-        (slopes,) = torch.autograd.grad(together, point, seeds, is_grads_batched=True)
-        n_weights, n_own = self.collocation.n_weights, self.collocation.discretisation.n_own
-        spare = torch.cat([slopes[:, n_weights:], slopes.new_zeros(len(slopes), 1)], -1)
-        local = slopes.new_zeros(self.collocation.n_segments, width, n_own)
-        shared = slopes.new_zeros(self.collocation.n_segments, width, jacobian.shared.shape[-1])
-        at = 0
-        for k, which in enumerate(rows):
-            mine = slice(at, at + len(which))
-            local[k, : len(which)] = slopes[mine, k * n_own : (k + 1) * n_own]
-            shared[k, : len(which)] = spare[mine][:, jacobian.index[k]]
-            at += len(which)
+            deviations = self._deviations(point, segment)
+        count, n_weights = len(deviations), self.collocation.n_weights
+        seeds = torch.eye(count, dtype=xi.dtype, device=xi.device)
+        (slopes,) = torch.autograd.grad(deviations, point, seeds, is_grads_batched=True)
+        row = torch.arange(count, device=xi.device)
+        local = slopes.new_zeros(self.collocation.n_segments, count, self.collocation.discretisation.n_own)
+        local[segment, row] = slopes[:, :n_weights].view(count, *local[:, 0].shape)[row, segment]
+        shared = slopes.new_zeros(self.collocation.n_segments, count, jacobian.shared.shape[-1])
+        spare = torch.cat([slopes[:, n_weights:], slopes.new_zeros(count, 1)], -1)
+        shared[segment, row] = spare.gather(-1, jacobian.index[segment])
         merged = replace(
             jacobian,
             local=torch.cat([jacobian.local, local], -2),
             shared=torch.cat([jacobian.shared, shared], -2),
         )
-        return self._merge(r, [d.detach() for d in deviations], width), merged
+        return self._merge(r, deviations.detach(), segment), merged
 
-    def _merge(self, r: Tensor, deviations: list[Tensor], width: int) -> Tensor:
-        k, n_rows = self.collocation.n_segments, self.collocation.discretisation.n_rows
-        padded = torch.stack([torch.nn.functional.pad(d, (0, width - len(d))) for d in deviations])
+    def _merge(self, r: Tensor, deviations: Tensor, segment: Tensor) -> Tensor:
+        k, n_rows, count = self.collocation.n_segments, self.collocation.discretisation.n_rows, len(deviations)
+        where = segment, torch.arange(count, device=r.device)
+        padded = deviations.new_zeros(k, count).index_put(where, deviations)
         segments = torch.cat([r[: k * n_rows].view(k, n_rows), padded], -1)
         return torch.cat([segments.flatten(), r[k * n_rows :]])
 

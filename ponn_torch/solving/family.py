@@ -21,6 +21,7 @@ from ponn_torch.optimal_control.discretisation import Discretisation
 from ponn_torch.optimal_control.pontryagin import Setting
 from ponn_torch.solving.guess import project
 from ponn_torch.solving.refinement import Segmentation, shared_out
+from ponn_torch.solving.switching import wrong_side
 
 
 def _warm() -> LevenbergMarquardt:
@@ -130,12 +131,9 @@ class Family:
             t, w, _ = made.on_each(made.unpack(self.xi), made.discretisation.nodes.between(n_points))
             segment = torch.arange(made.n_segments, device=t.device).repeat_interleave(t.shape[-1])
             t, w = t.flatten(1), w.flatten(1, 2)
-            codes = arcs[segment].repeat(len(self), 1)
             switching = self._minimiser(t, w, None, segment).switching
-            wrong = made.bvp.law.arc_codes(switching) != codes
-            # S of a curved law comes in two halves, one per bound; the nearer of the two says how far
-            how_far = torch.stack(switching.abs().chunk(2 if made.bvp.law.curved else 1, -1)).amin(0)
-            return (torch.where(wrong, how_far, torch.zeros_like(how_far)).view(len(self), -1).amax(-1),)
+            wrong = wrong_side(switching, arcs[segment].repeat(len(self), 1))
+            return (wrong.clamp_min(0.0).view(len(self), -1).amax(-1),)
 
         return made.replayed(f"disagreement at {n_points}", depth, self.xi)[0]
 

@@ -167,9 +167,12 @@ class Segments:
 
 
 def shared_out(lengths: Sequence[float], n_segments: int) -> list[int]:
-    """Segments for every arc, at least one and n_segments in all, so that the longest segment is as short as can be."""
+    """Segments for every arc, so that the longest is as short as can be: n_segments, and one more for two switches.
+
+    Their total depends on the number of arcs alone, so that splits with as many arcs share their tapes.
+    """
     counts = [1] * len(lengths)
-    for _ in range(n_segments - len(lengths)):
+    for _ in range(n_segments + (len(lengths) - 1) // 2 - len(lengths)):
         longest = max(range(len(lengths)), key=lambda i: lengths[i] / counts[i])
         counts[longest] += 1
     return counts

@@ -181,7 +181,7 @@ class Split(Segmentation):
 
 
 def _spread(structure: Structure, times: Tensor, n_segments: int) -> Segments:
-    """Cut every arc into equal segments, n_segments in all where there are no more arcs."""
+    """Cut every arc into equal segments."""
     ends = torch.cat([times[:1], structure.times, times[-1:]])
     counts = shared_out(ends.diff().tolist(), n_segments)
     knots, codes = [ends[:1]], []

@@ -20,7 +20,7 @@ from ponn_torch.optimal_control.curve import Curve
 from ponn_torch.optimal_control.discretisation import Discretisation
 from ponn_torch.optimal_control.pontryagin import Setting
 from ponn_torch.solving.guess import RandomGuess, project
-from ponn_torch.solving.refinement import Outcome, Subdivide
+from ponn_torch.solving.refinement import Outcome, Subdivide, shared_out
 from ponn_torch.solving.sharpening import legible
 from ponn_torch.solving.solution import Solution
 from ponn_torch.solving.split import Split
@@ -171,3 +171,15 @@ def test_an_interrupted_refinement_keeps_its_curve(make):
     assert refined.outcome is Outcome.INTERRUPTED
     assert refined.rounds[-1].status is Status.INTERRUPTED
     assert torch.isfinite(refined.curve.xi).all()
+
+
+@pytest.mark.parametrize("n_segments", [1, 4, 8, 13])
+@pytest.mark.parametrize("lengths", [[1.0], [0.2, 0.8], [1e-6, 0.5, 0.5], [0.05, 0.3, 0.05, 0.2, 0.4], [0.1] * 10])
+def test_segments_are_shared_out_so_that_the_longest_is_short(lengths, n_segments):
+    counts = shared_out(lengths, n_segments)
+    assert min(counts) >= 1
+    assert sum(counts) == max(len(lengths), n_segments + (len(lengths) - 1) // 2)
+    longest = max(length / count for length, count in zip(lengths, counts, strict=True))
+    for i, count in enumerate(counts):  # a segment taken from anywhere leaves one that is as long
+        if count > 1:
+            assert lengths[i] / (count - 1) >= longest
