@@ -49,13 +49,18 @@ class Regulariser(Protocol):
 
 @dataclass(frozen=True)
 class Entropy:
-    """e = ½[η ln η + (1−η) ln(1−η)], so η = ½(1 + tanh(S/ρ)): the tanh law (PoNN paper, eq. 44–45)."""
+    """e = ½[η ln 2η + (1−η) ln 2(1−η)], so η = ½(1 + tanh(S/ρ)): the tanh law (PoNN paper, eq. 44–45).
+
+    The constant ½ ln 2 in it makes e ≥ 0: with a free final time a negative e would pay for every second of part
+    throttle, and the cheapest way to land would be to hover.
+    """
 
     def fraction(self, switching: Tensor, smoothing: Tensor) -> Tensor:
         return 0.5 * (1.0 + torch.tanh(switching / smoothing))
 
     def penalty(self, fraction: Tensor) -> Tensor:
-        return 0.5 * (torch.xlogy(fraction, fraction) + torch.xlogy(1.0 - fraction, 1.0 - fraction))
+        rest = 1.0 - fraction
+        return 0.5 * (torch.xlogy(fraction, 2.0 * fraction) + torch.xlogy(rest, 2.0 * rest))
 
 
 @dataclass(frozen=True)

@@ -83,8 +83,9 @@ class Solver:
         optimizer, continuation, guess: of the smoothed stages. refinement: None to stop at the smoothed solution.
         n_starts: random starts to try at most; start i of seed s uses the random stream 1000 s + i.
         n_certified: stop at this many certified extremals and keep the cheapest; several extremals are real.
-        start_limit: ‖r‖ of the first stage above which a start has failed; where nothing is smoothed and the iteration
-            has settled, it is the ansatz that is too coarse, and the refinement goes on from there.
+        start_limit: ‖r‖ above which a first stage has failed, and at the next smoothing the start; where nothing is
+            smoothed and the iteration has settled, it is the ansatz that is too coarse, and the refinement goes on
+            from there.
         warm_damping: first damping of a stage that starts from the one before, if the optimiser asks for more.
         stage_tolerance: ‖r‖ at which a stage ends that only leads to a refinement, if the optimiser asks for less.
         trust: a stage is kept while its off-node residual is below this fraction of the largest rate; below the
@@ -311,10 +312,10 @@ class _Run:
         xi = project(current, solver.guess.curve(bvp, 1000 * self.seed + self.start))
         kept: list[Solution] = []
         message = ""
-        first = True
+        first, tries = True, 0
 
         def attempt(value: float, parameter: str, form: Form | None, *, hold: bool = False) -> Outcome:
-            nonlocal current, xi, message, first
+            nonlocal current, xi, message, first, tries
             if self.clock.spent and not first:
                 return Outcome.ABORT
             trial = replace(current, discretisation=self._discretisation(form))
@@ -338,9 +339,12 @@ class _Run:
             if first and failed:
                 message = (
                     f"start {self.start + 1} of seed {self.seed} failed: ‖r‖ = {norm:.2g} "
-                    f"after the first stage ({result.status.value})"
+                    f"after the {('first', 'second')[tries]} stage ({result.status.value})"
                 )
-                return Outcome.ABORT
+                tries += 1
+                # smoothed less, the problem may have a solution, or one that is nearer to this guess
+                again = tries == 1 and self._smoothable and parameter == "smoothing" and not self.clock.spent
+                return Outcome.FAILED if again else Outcome.ABORT
             if failed:
                 return Outcome.FAILED
             first = False

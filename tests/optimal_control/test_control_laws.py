@@ -90,8 +90,20 @@ def test_the_entropy_law_is_the_tanh_law_of_the_papers():
     torch.testing.assert_close(Entropy().fraction(switching, tensor(0.3)), expected, rtol=0, atol=0)
 
 
-def test_the_entropy_of_the_bounds_is_zero_and_not_nan():
-    assert Entropy().penalty(tensor([0.0, 1.0])).tolist() == [0.0, 0.0]
+def test_the_entropy_vanishes_in_the_middle_and_is_a_number_at_the_bounds():
+    assert Entropy().penalty(tensor([0.0, 0.5, 1.0])).tolist() == pytest.approx(
+        [0.5 * math.log(2), 0.0, 0.5 * math.log(2)]
+    )
+
+
+@pytest.mark.parametrize("name", REGULARISERS)
+@pytest.mark.parametrize("smoothing", [1.0, 0.3, 0.01])
+def test_part_throttle_is_never_paid_for(name, smoothing):
+    """η + ρ e(η) ≥ 0, the smoothed cost of a second of thrust: else a longer flight would be a cheaper one."""
+    fraction = torch.linspace(0, 1, 1001, dtype=torch.float64)
+    cost = fraction + smoothing * make_regulariser(name).penalty(fraction)
+    assert float(cost.min()) > -1e-15
+    assert float(cost[1:].min()) > 0
 
 
 def test_the_logarithmic_law_keeps_its_digits_far_from_the_switch():

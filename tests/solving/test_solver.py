@@ -350,8 +350,8 @@ def test_an_infeasible_transfer_is_recognised_early_with_a_message():
     assert not result.certified
     assert result.n_starts == 2
     assert result.message.startswith("start 2 of seed 3 failed: ‖r‖ = 0.")
-    assert "after the first stage" in result.message
-    assert [stage.start for stage in result.stages] == [0, 1]
+    assert "after the second stage" in result.message
+    assert [(stage.start, stage.smoothing) for stage in result.stages] == [(0, 1.0), (0, 0.3), (1, 1.0), (1, 0.3)]
     assert all(stage.n_iterations <= 60 and stage.norm > 0.1 for stage in result.stages)
     assert result.solution is not None  # what there is can be looked at
 
