@@ -1,4 +1,4 @@
-"""Lunar descents in free time with an engine that can be shut off: nothing but the shift of the entropy forbids hovering.
+"""Lunar descents in free time with an engine that can be shut off: no step of the solution may pay for hovering.
 
 A vertical one is a free fall and a burn at full thrust, in closed form. Its primer is parallel to gravity and
 may change its sign, where the direction of the smoothed thrust jumps. The run from the command line takes this file.
