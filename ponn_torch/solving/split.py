@@ -35,6 +35,7 @@ from ponn_torch.solving.switching import (
 
 COLLAPSED = 1e-7  # fraction of the final time, below which an arc is solved away to nothing
 LEGIBLE = 1e-4  # ‖r‖ of a sharpened curve whose arcs are worth reading
+MOVED = 1e-3  # fraction of the final time: arcs are split anew where a sharper curve moves a switch by more
 SAME_SWITCH = 1e-6  # scaled times that differ by less are those of one switch
 MORE_SEGMENTS = 4  # multiples of n_segments that are tried where there is no smoothing to lower
 
@@ -46,7 +47,7 @@ class Split(Segmentation):
     Every arc is one or more segments; those that subdivide it sit at fixed fractions between its switches. Where S asks
     for other arcs one is added, as a needle that the next round widens; arcs that a failed round made collapse are
     merged away. When this does not end, the smoothed curve was too blunt to show the structure: it is sharpened step by
-    step on graded segments, and a structure that was not read before is split anew.
+    step on graded segments, and arcs or switch times that were not read before are split anew.
 
     Attributes:
         max_arcs: more arcs than this are taken for a sign of a singular arc.
@@ -80,8 +81,9 @@ class Split(Segmentation):
                     # of the same arcs the curve's own times fit it better
                     structures = structures if guessed.same_arcs(structures[0]) else [guessed, *structures]
             blunter = smoothed
+            moved = MOVED * float(smoothed.times[-1])
             for structure in structures:
-                if any(structure.same_arcs(other) and n_segments == n for other, n in read):
+                if any(structure.near(other, moved) and n_segments == n for other, n in read):
                     continue
                 read.append((structure, n_segments))
                 refined = self._split(disc, smoothed, structure, n_segments, rounds, callback)
@@ -97,22 +99,26 @@ class Split(Segmentation):
     def _starts(
         self, disc: Discretisation, start: Curve, rounds: list[OptimizeResult], callback: MakeCallback | None
     ) -> Iterator[tuple[Curve, int]]:
-        """Curves to read the arcs from, and numbers of segments: ever sharper ones, or where none is smoothed, more."""
-        yield start, self.n_segments
+        """Curves to read the arcs from, and numbers of segments: ever sharper ones, or where none is smoothed, more.
+
+        A split begins with as many segments as the curve that it starts from, if that leaves some to be halved.
+        """
+        least = max(self.n_segments, min(start.collocation.n_segments, self.max_segments // 2))
+        yield start, least
         smoothing, factor = start.smoothing, self.sharpening
         for attempt in range(self.max_sharpenings):
             if not smoothing:
                 if attempt < MORE_SEGMENTS:
-                    yield start, (attempt + 2) * self.n_segments
+                    yield start, (attempt + 2) * least
                 continue
             sharper = factor * smoothing
-            times = graded_times(start, sharper, self.n_segments)
+            times = graded_times(start, sharper, least)
             collocation = Collocation.on_segments(disc, times, setting=start.collocation.setting)
             curve, result = self.solve(collocation.with_setting(smoothing=sharper), start, callback)
             rounds.append(result)
             if result.status.cut or float(result.norm) < LEGIBLE:
                 start, smoothing = curve, sharper
-                yield start, self.n_segments
+                yield start, least
             else:
                 factor = factor**0.5
 

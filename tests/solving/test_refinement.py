@@ -20,10 +20,10 @@ from ponn_torch.optimal_control.curve import Curve
 from ponn_torch.optimal_control.discretisation import Discretisation
 from ponn_torch.optimal_control.pontryagin import Setting
 from ponn_torch.solving.guess import RandomGuess, project
-from ponn_torch.solving.refinement import Outcome, Subdivide, shared_out
+from ponn_torch.solving.refinement import Outcome, Refined, Subdivide, shared_out
 from ponn_torch.solving.sharpening import legible
 from ponn_torch.solving.solution import Solution
-from ponn_torch.solving.split import Split
+from ponn_torch.solving.split import MOVED, Split
 from ponn_torch.solving.switching import find_structure
 
 OPTIMA = {"earth_mars": 396.05984393, "mars_landing": 268.0146563274}
@@ -90,6 +90,38 @@ def test_rounds_that_run_out_are_said():
     refined = Split(max_rounds=1, max_sharpenings=0).run(smoothed("earth_mars", 1.0))
     assert refined.outcome is Outcome.STRUCTURE
     assert len(refined.rounds) == 1
+
+
+class Unlucky(Split):
+    """A split that notes what it is asked to try, and solves none of it."""
+
+    def __init__(self, **settings):
+        super().__init__(**settings)
+        object.__setattr__(self, "tried", [])
+
+    def _split(self, disc, curve, structure, n_segments, rounds, callback):
+        self.tried.append((structure, n_segments))
+        return Refined(curve, Outcome.RESIDUAL, rounds)
+
+
+def test_arcs_that_were_not_solved_are_tried_again_once_a_sharper_curve_has_moved_their_switches():
+    """What failed may have been the start: from ρ = 1 to 0.5 the switches of Earth–Mars move by eight to ten days."""
+    split, start = Unlucky(max_sharpenings=3), smoothed("earth_mars", 1.0)
+    assert split.run(start).outcome is Outcome.RESIDUAL
+    tried = [structure for structure, _ in split.tried]
+    pairs = [(one, other) for i, one in enumerate(tried) for other in tried[:i] if one.same_arcs(other)]
+    assert pairs
+    assert not any(one.near(other, MOVED * float(start.times[-1])) for one, other in pairs)
+
+
+@pytest.mark.parametrize(("n_segments", "first"), [(3, 8), (12, 12), (100, 64)])
+def test_a_split_begins_with_the_segments_of_its_start(n_segments, first):
+    blunt = smoothed("earth_mars", 1.0)
+    times = torch.linspace(0, 1, n_segments + 1, dtype=torch.float64) * blunt.times[-1]
+    fine = Collocation.on_segments(blunt.collocation.discretisation, times, setting=blunt.collocation.setting)
+    split = Unlucky(max_sharpenings=0)
+    split.run(Curve(fine, project(fine, blunt)))
+    assert [n for _, n in split.tried] == [first]
 
 
 @pytest.mark.parametrize(("name", "smoothing"), [("earth_mars", 0.03), ("mars_landing", 0.1)])
