@@ -9,11 +9,14 @@ from pathlib import Path
 
 import pytest
 
+from ponn_torch.ansatz.basis import Legendre
 from ponn_torch.cli import main
 from ponn_torch.cli.explain import explanation
 from ponn_torch.optimal_control.control_laws import Box
 from ponn_torch.problems.double_integrator import minimum_energy
+from ponn_torch.problems.earth_mars import EARTH_VENUS, earth_mars
 from ponn_torch.problems.mars_landing import mars_landing
+from ponn_torch.solving.paths import PolarTransfer
 from ponn_torch.solving.solver import Solver
 
 HOPELESS = Solver(start_limit=1e-300, n_starts=1)
@@ -25,6 +28,19 @@ def test_infeasible_in_the_time_given_and_nothing_else_is_asked() -> None:
     assert sentence == (
         "infeasible unless a quicker one exists: "
         "the minimum-time extremal found (certified) takes 2 s, more than final_time = 1.9 s"
+    )
+
+
+@pytest.mark.slow
+def test_infeasible_with_the_thrust_given_and_nothing_else_is_asked() -> None:
+    """One extra revolution on the way to Venus: 340 days would do for it, 1000 are too many."""
+    solver = Solver(
+        basis=Legendre(14), conditioning="orthonormal", n_nodes=20, n_segments=12, guess=PolarTransfer(revolutions=1)
+    )
+    (sentence,) = explanation(earth_mars(**EARTH_VENUS), solver, 0, None)
+    assert sentence == (
+        "infeasible unless less will do: "
+        "the least-control extremal found (certified) needs thrust up to 0.4734805 N, more than 0.33 N"
     )
 
 

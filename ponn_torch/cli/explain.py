@@ -11,12 +11,12 @@ from ponn_torch.baselines.symbolic import load_casadi
 from ponn_torch.optimal_control.pontryagin import BoundaryValueProblem
 from ponn_torch.optimal_control.problem import OptimalControlProblem
 from ponn_torch.reporting.style import number, unit
-from ponn_torch.solving.feasibility import check_final_time
+from ponn_torch.solving.feasibility import check_control, check_final_time
 from ponn_torch.solving.guess import Guess, RandomGuess, ScaledCurve
 from ponn_torch.solving.solution import Solution
 from ponn_torch.solving.solver import Solver
 
-N_STARTS, N_SEGMENTS = 4, 100  # of the minimum-time problem; of the direct mesh
+N_STARTS, N_SEGMENTS = 4, 100  # of the problems that ask what is feasible; of the direct mesh
 
 
 class _FromSolution:
@@ -37,10 +37,12 @@ class _FromSolution:
 
 def explanation(problem: OptimalControlProblem, solver: Solver, seed: int, solution: Solution | None) -> list[str]:
     """Sentences to add to the message of a failed solve; ``solution`` is what it ended with, if anything."""
-    found = check_final_time(problem, replace(solver, n_starts=N_STARTS), seed)
-    if found is not None and found.infeasible:
-        return [found.message]
-    sentences = [] if found is None else [found.message]
+    sentences = []
+    for check in (check_final_time, check_control):
+        found = check(problem, replace(solver, n_starts=N_STARTS), seed)
+        if found is not None and found.infeasible:
+            return [found.message]
+        sentences += [] if found is None else [found.message]
     return [*sentences, *_witness(problem, solver, solution)]
 
 

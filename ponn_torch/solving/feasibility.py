@@ -1,9 +1,11 @@
-"""Evidence on a failed solve: is the fixed final time shorter than the shortest one?
+"""Evidence on a failed solve: is the fixed final time shorter than the shortest one, or the control too weak for it?
 
 The minimum-time twin of a problem has its dynamics, ends and controls, a free final time, and that time as the cost.
-Where its certified extremal takes longer than the problem allows, the problem is called infeasible unless a quicker
-one exists: an extremal satisfies necessary conditions, and there may be several, so this is evidence and not a proof.
-Where it takes less, the problem is feasible; where it is not certified itself, nothing is claimed.
+The least-control twin keeps the time too, and makes the multiple of the control's bounds that it takes the cost: a
+transfer of few revolutions in a long time needs more thrust than one in its shortest time. Where the certified extremal
+of a twin takes more than the problem allows, the problem is called infeasible unless a quicker, or weaker, one exists:
+an extremal satisfies necessary conditions, and there may be several, so this is evidence and not a proof. Where the
+least control is within the bounds, the problem is feasible; where a twin is not certified itself, nothing is claimed.
 """
 
 from __future__ import annotations
@@ -15,8 +17,11 @@ from torch import Tensor
 
 from ponn_torch.optimal_control.control_laws import Bounded
 from ponn_torch.optimal_control.problem import DisplayUnit, FreeTime, Named, OptimalControlProblem
+from ponn_torch.solving.solution import Solution
 from ponn_torch.solving.solver import Solver
 from ponn_torch.solving.split import Split
+
+MULTIPLE = "multiple_of_the_bounds"  # the least-control twin's further state
 
 
 @dataclass(frozen=True)
@@ -53,6 +58,39 @@ class Feasibility:
         return f"not for want of time: a minimum-time extremal (certified) takes {least}, final_time = {given}"
 
 
+@dataclass(frozen=True)
+class ControlNeeded:
+    """What the least-control twin says.
+
+    Attributes:
+        name: the control. allowed: its largest bound, SI. needed: that bound in the twin's certified extremal, locally
+            the least at best; None where it has none.
+        cpu_seconds: of the twin, its certificate apart.
+        unit: the unit that the message is written in.
+    """
+
+    name: str
+    allowed: float
+    needed: float | None
+    cpu_seconds: float
+    unit: DisplayUnit
+
+    @property
+    def infeasible(self) -> bool:
+        """As far as the extremal found tells."""
+        return self.needed is not None and self.needed > self.allowed
+
+    @property
+    def message(self) -> str:
+        if self.needed is None:
+            return f"how much {self.name} it needs is not known: its least-control problem was not certified either"
+        least, given = (f"{u / self.unit.size:.8g} {self.unit.label}".rstrip() for u in (self.needed, self.allowed))
+        if self.infeasible:
+            found = f"the least-control extremal found (certified) needs {self.name} up to {least}, more than {given}"
+            return f"infeasible unless less will do: {found}"
+        return f"not for want of {self.name}: an extremal (certified) needs no more than {least} of {given}"
+
+
 def minimum_time_twin(problem: OptimalControlProblem) -> OptimalControlProblem:
     """The same dynamics, ends and controls, as fast as possible.
 
@@ -62,11 +100,6 @@ def minimum_time_twin(problem: OptimalControlProblem) -> OptimalControlProblem:
     if not isinstance(problem.control, Bounded):
         raise ValueError(f"{problem.name}: its control has no bounds, so that there is no minimum time")
     time = problem.unit("time")
-    # H = 1 + λᵀf vanishes, so λ is of the order of one over what the control changes
-    strength = _control_strength(problem)
-    costate_units = {
-        name: time / problem.unit(name) / (1.0 if name == problem.mass else strength) for name in problem.states
-    }
     return replace(
         problem,
         name=f"{problem.name}_minimum_time",
@@ -75,15 +108,65 @@ def minimum_time_twin(problem: OptimalControlProblem) -> OptimalControlProblem:
         terminal_cost=None,
         final_time=FreeTime(problem.time_guess),
         units={**problem.units, "cost": time},
-        costate_units=costate_units,
+        costate_units=_costate_units(problem, time, time),  # as H = 1 + λᵀf vanishes
         cost_name="time",
         known_cost=None,
         display={**problem.display, "cost": problem.display.get("time", DisplayUnit("s"))},
     )
 
 
+def least_control_twin(problem: OptimalControlProblem) -> OptimalControlProblem:
+    """The same dynamics, ends and time, with the control's bounds multiplied by a constant, the least that will do.
+
+    The multiple is a further state, free at both ends. As it is paid once, the unit of cost is a time unit's share of
+    it; otherwise the smoothing, which is paid all the time, would outweigh it.
+
+    Raises:
+        ValueError: a control without bounds, or whose bounds exclude zero, so that they cannot shrink towards it.
+    """
+    law = problem.control
+    if not isinstance(law, Bounded):
+        raise ValueError(f"{problem.name}: its control has no bounds, so that any amount of it is allowed")
+    low, high = _bounds(problem)
+    if not low <= 0 <= high:
+        raise ValueError(f"{problem.name}: {law.name} from {low:g} to {high:g}; allowed: bounds that include zero")
+
+    def dynamics(t: Tensor, x: Named, u: Named, p: Named) -> dict[str, Tensor]:
+        multiple = getattr(x, MULTIPLE)
+        enlarged = Named(**{name: multiple * value for name, value in vars(u).items()})
+        return {**problem.dynamics(t, x, enlarged, p), MULTIPLE: torch.zeros_like(t)}
+
+    time = problem.time_guess
+    return replace(
+        problem,
+        name=f"{problem.name}_least_control",
+        description=f"{problem.description or problem.name}: with as little control as possible",
+        states={**problem.states, MULTIPLE: 1},
+        dynamics=dynamics,
+        running_cost=None,
+        terminal_cost=lambda t, x, p: getattr(x, MULTIPLE),
+        units={**problem.units, MULTIPLE: 1.0, "cost": problem.unit("time") / time},
+        costate_units={**_costate_units(problem, 1.0, time), MULTIPLE: 1.0},
+        cost_name="multiple of the bounds",
+        known_cost=None,
+        display={**problem.display, "cost": DisplayUnit("")},
+    )
+
+
 def _one(t: Tensor, x: Named, u: Named, p: Named) -> Tensor:
     return torch.ones_like(t)
+
+
+def _costate_units(problem: OptimalControlProblem, cost: float, time: float) -> dict[str, float]:
+    """λ of the order of the cost over what full control changes in a time."""
+    strength = _control_strength(problem) * time / problem.unit("time")
+    return {name: cost / problem.unit(name) / (1.0 if name == problem.mass else strength) for name in problem.states}
+
+
+def _bounds(problem: OptimalControlProblem) -> tuple[float, float]:
+    assert isinstance(problem.control, Bounded)
+    low, high = problem.control.bounds(Named(**problem.parameters))
+    return float(low), float(high)
 
 
 def _control_strength(problem: OptimalControlProblem) -> float:
@@ -95,7 +178,7 @@ def _control_strength(problem: OptimalControlProblem) -> float:
     x = torch.tensor([start], dtype=torch.float64)
     t = torch.zeros_like(x[:, :1])
     p = Named(**{name: torch.full_like(t, value) for name, value in problem.parameters.items()})
-    low, high = law.bounds(p)
+    full_control = max(map(abs, _bounds(problem)))
     least = {name: torch.zeros(1, size, dtype=torch.float64) for name, size in law.names.items()}
 
     def rates(control: Tensor) -> dict[str, Tensor]:
@@ -103,7 +186,7 @@ def _control_strength(problem: OptimalControlProblem) -> float:
         return dict(problem.dynamics(t, problem.named(x), u, p))
 
     off = rates(least[law.name])
-    full = rates(least[law.name] + torch.maximum(torch.as_tensor(high).abs(), torch.as_tensor(low).abs()))
+    full = rates(least[law.name] + full_control)
     changes = [
         float((full[name] - off[name]).abs().max()) * time / problem.unit(name)
         for name in problem.states
@@ -119,14 +202,40 @@ def check_final_time(problem: OptimalControlProblem, solver: Solver, seed: int =
     """
     if problem.free_final_time or not isinstance(problem.control, Bounded):
         return None
-    given = solver.refinement
-    refinement = given if given is not None and given.exact and given.reads_arcs else Split()
-    twin = replace(solver, refinement=refinement, n_certified=1)
-    result = twin.solve(minimum_time_twin(problem), seed)
-    certified = result.solution if result.certified else None
+    solution, seconds = _solved(minimum_time_twin(problem), solver, seed)
     return Feasibility(
         final_time=problem.time_guess,
-        minimum_time=None if certified is None else certified.final_time,
-        cpu_seconds=result.cpu_seconds,
+        minimum_time=None if solution is None else solution.final_time,
+        cpu_seconds=seconds,
         clock=problem.display.get("time", DisplayUnit("s")),
     )
+
+
+def check_control(problem: OptimalControlProblem, solver: Solver, seed: int = 0) -> ControlNeeded | None:
+    """Solve the least-control twin with the same solver; None where the question does not arise.
+
+    That is: a final time that is free, or a control without bounds or whose bounds exclude zero.
+    """
+    law = problem.control
+    if problem.free_final_time or not isinstance(law, Bounded):
+        return None
+    low, high = _bounds(problem)
+    if not low <= 0 <= high:
+        return None
+    solution, seconds = _solved(least_control_twin(problem), solver, seed)
+    allowed = max(-low, high)
+    return ControlNeeded(
+        name=law.name,
+        allowed=allowed,
+        needed=None if solution is None else solution.cost * allowed,
+        cpu_seconds=seconds,
+        unit=problem.display.get(law.name, DisplayUnit("")),
+    )
+
+
+def _solved(twin: OptimalControlProblem, solver: Solver, seed: int) -> tuple[Solution | None, float]:
+    """The certified extremal of a twin, if there is one, and CPU seconds."""
+    given = solver.refinement
+    refinement = given if given is not None and given.exact and given.reads_arcs else Split()
+    result = replace(solver, refinement=refinement).solve(twin, seed)
+    return result.solution if result.certified else None, result.cpu_seconds

@@ -7,7 +7,7 @@ have to do. The problem must name a position and a velocity of the same size.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -141,16 +141,20 @@ class PolarTransfer:
     """Polar interpolation of a transfer about the z axis, ``revolutions`` extra turns, λv against the thrust it needs.
 
     The angle follows a cubic that meets the angular rates at both ends, the radius and height likewise; λv is scaled
-    to a mean of one.
+    to a mean of one. Of several numbers of revolutions every start takes the next.
     """
 
-    revolutions: int = 0
+    revolutions: int | Sequence[int] = 0
     position: str = "r"
     velocity: str = "v"
 
     def __post_init__(self) -> None:
-        if self.revolutions < 0:
-            raise ValueError(f"revolutions = {self.revolutions}; allowed: 0, 1, 2, …")
+        if not self._several or min(self._several) < 0:
+            raise ValueError(f"revolutions = {self.revolutions}; allowed: 0, 1, 2, …, or a list of these")
+
+    @property
+    def _several(self) -> Sequence[int]:
+        return [self.revolutions] if isinstance(self.revolutions, int) else self.revolutions
 
     def curve(self, bvp: BoundaryValueProblem, seed: int) -> ScaledCurve:
         ends = _ends(bvp, self.position, self.velocity)
@@ -159,6 +163,7 @@ class PolarTransfer:
                 f"guess: state {self.position!r} has {len(ends.position[0])} components in problem "
                 f"{bvp.problem.name!r}; a polar transfer needs 3"
             )
+        revolutions = self._several[seed % len(self._several)]
         polar = [_polar(r, v) for r, v in zip(ends.position, ends.velocity, strict=True)]
         (values0, rates0), (values1, rates1) = polar
         turn = (
@@ -167,7 +172,7 @@ class PolarTransfer:
             else -((values0[1] - values1[1]) % (2 * math.pi))
         )
         values1 = values1.clone()
-        values1[1] = values0[1] + turn + 2 * math.pi * self.revolutions * (1 if rates0[1] >= 0 else -1)
+        values1[1] = values0[1] + turn + 2 * math.pi * revolutions * (1 if rates0[1] >= 0 else -1)
         time = bvp.problem.time_guess
 
         def path(s: Tensor) -> Tensor:

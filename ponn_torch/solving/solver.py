@@ -81,7 +81,8 @@ class Solver:
         basis: free function of the smoothed stages: a basis (its size is the number of neurons per chain) or a network.
         node_kind, n_nodes: collocation points per segment. form: strong or weak residual. n_segments: fixed segments.
         optimizer, continuation, guess: of the smoothed stages. refinement: None to stop at the smoothed solution.
-        n_starts: random starts to try at most; start i of seed s uses the random stream 1000 s + i.
+        n_starts: starts to try at most; start i of seed s uses the random stream 1000 s + i. They end early where
+            one begins as the first did: a guess with nothing random in it has one start.
         n_certified: stop at this many certified extremals and keep the cheapest; several extremals are real.
         start_limit: ‖r‖ above which a first stage has failed, and at the next smoothing the start; where nothing is
             smoothed and the iteration has settled, it is the ansatz that is too coarse, and the refinement goes on
@@ -226,12 +227,17 @@ class _Run:
 
     def result(self) -> SolveResult:
         best: tuple[Solution, Certificate] | None = None
-        message, interrupted, n_certified = "", False, 0
+        guess: Tensor | None = None
+        message, verdict, interrupted, n_certified = "", "", False, 0
         try:
             for start in range(self.solver.n_starts):
-                self.start = start
                 with self.clock:
-                    candidate, note = self._one_start()
+                    first_stage, xi = self._guessed(start)
+                    if guess is not None and torch.equal(xi, guess):
+                        break
+                    guess = xi if guess is None else guess
+                    self.start = start
+                    candidate, note = self._one_start(first_stage, xi)
                 message = note or message
                 if candidate is None:
                     if self.clock.spent:
@@ -241,12 +247,15 @@ class _Run:
                 n_certified += judged.certified
                 if best is None or _better(judged, best[1]):
                     best, message = (candidate, judged), note or judged.verdict
+                    verdict = message
                 # a start that came through its stages is the answer where nothing aims at a certificate
                 enough = n_certified if self.solver.exact else 1
                 if enough >= self.solver.n_certified or self.clock.spent:
                     break
         except (_Interrupted, KeyboardInterrupt):
             interrupted, message = True, "interrupted; the best stage so far is kept"
+        if best is not None and best[1].certified and not interrupted:
+            message = verdict if n_certified == 1 else f"{verdict}; the cheapest of {n_certified} certified starts"
         spent = self.clock.spent and n_certified < self.solver.n_certified
         if spent and not (best and best[1].certified) and Status.BUDGET.value not in message:
             message = f"{Status.BUDGET.value}: {message}"
@@ -261,9 +270,18 @@ class _Run:
         seconds = self.clock.seconds
         return SolveResult(solution, certificate, self.stages, self.start + 1, message, seconds, interrupted, spent)
 
-    def _one_start(self) -> tuple[Solution | None, str]:
+    def _guessed(self, start: int) -> tuple[Collocation, Tensor]:
+        """The collocation of the first stage, and a start's guess projected on it."""
+        like = self.bvp.unit
+        share = torch.linspace(0.0, 1.0, self.solver.n_segments + 1, dtype=like.dtype, device=like.device)
+        collocation = Collocation.on_segments(self._discretisation(None), share * self.bvp.final_time)
+        if self._smoothable:
+            collocation = collocation.with_setting(smoothing=1.0)
+        return collocation, project(collocation, self.solver.guess.curve(self.bvp, 1000 * self.seed + start))
+
+    def _one_start(self, collocation: Collocation, xi: Tensor) -> tuple[Solution | None, str]:
         """Everything between a first guess and a trajectory to be judged; None and why where that fails."""
-        stages, message = self._continuation()
+        stages, message = self._continuation(collocation, xi)
         if not stages:
             return None, message
         smoothed = stages[-1]
@@ -301,15 +319,9 @@ class _Run:
         solver = self.solver
         return loosened(solver.optimizer, solver.stage_tolerance) if self._reads_arcs else solver.optimizer
 
-    def _continuation(self) -> tuple[list[Solution], str]:
+    def _continuation(self, current: Collocation, xi: Tensor) -> tuple[list[Solution], str]:
         """Walk the schedule from one start; the stages that can be trusted, the sharpest last, or none and why."""
-        solver, bvp = self.solver, self.bvp
-        like = bvp.unit
-        times = torch.linspace(0.0, 1.0, solver.n_segments + 1, dtype=like.dtype, device=like.device) * bvp.final_time
-        current = Collocation.on_segments(self._discretisation(None), times)
-        if self._smoothable:
-            current = current.with_setting(smoothing=1.0)
-        xi = project(current, solver.guess.curve(bvp, 1000 * self.seed + self.start))
+        solver = self.solver
         kept: list[Solution] = []
         message = ""
         first, tries = True, 0

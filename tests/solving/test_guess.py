@@ -212,6 +212,14 @@ def test_polar_transfers_turn_as_often_as_they_are_told(revolutions):
     assert 0.5 < float((costates[:, 3:6].norm(dim=-1) / unit).mean()) < 2.0
 
 
+def test_of_several_revolutions_every_start_takes_the_next():
+    bvp = bvp_of("energy_transfer")
+    t = torch.linspace(0, 1, 7, dtype=torch.float64) * bvp.final_time
+    several = [PolarTransfer([3, 1]).curve(bvp, start)(t) for start in range(3)]
+    for curve, revolutions in zip(several, [3, 1, 3], strict=True):
+        assert torch.equal(curve, PolarTransfer(revolutions).curve(bvp, 0)(t))
+
+
 def test_a_backward_orbit_turns_backward():
     made = problem("energy_transfer").with_boundary(
         initial={"r": [1.5e11, 0.0, 0.0], "v": [0.0, -3e4, 0.0]},
@@ -230,6 +238,8 @@ def test_a_backward_orbit_turns_backward():
     [
         (lambda: RandomGuess("gaussian"), "distribution = 'gaussian'; allowed: uniform, symmetric, normal"),
         (lambda: PolarTransfer(-1), "revolutions = -1; allowed: 0, 1, 2"),
+        (lambda: PolarTransfer([2, -1]), r"revolutions = \[2, -1\]; allowed: 0, 1, 2"),
+        (lambda: PolarTransfer([]), r"revolutions = \[\]; allowed: 0, 1, 2"),
         (
             lambda: StraightLine().curve(bvp_of("minimum_energy"), 0),
             "guess needs a state 'r' in problem 'double_integrator_energy'; allowed: x, v",

@@ -385,6 +385,52 @@ def test_the_cheapest_of_several_certified_extremals_is_kept():
     assert result.solution.cost / unit == pytest.approx(0.0142251748586, abs=1e-12)
 
 
+@dataclass(frozen=True)
+class Scripted:
+    """A guess whose starts are good or not a number."""
+
+    good: tuple[bool, ...]
+
+    def curve(self, bvp, seed):
+        good = self.good[seed % len(self.good)]
+        return RandomGuess().curve(bvp, seed) if good else lambda t: t.new_full((*t.shape, 2 * bvp.n_states), math.nan)
+
+
+@pytest.mark.parametrize(("good", "count"), [((True, False), 1), ((True, True, False), 2), ((False, True, True), 2)])
+def test_the_message_is_that_of_the_start_which_is_kept(good, count):
+    result = Solver(guess=Scripted(good), n_starts=len(good), n_certified=5).solve(problem("minimum_energy"))
+    assert result.certified
+    assert result.n_starts == len(good)
+    several = "; the cheapest of 2 certified starts" if count == 2 else ""
+    assert result.message == f"{result.certificate.verdict}{several}"
+
+
+@pytest.mark.parametrize(("revolutions", "allowed", "tried"), [(0, 9, 1), ((0, 1), 9, 2), ((0, 1, 2), 2, 2)])
+def test_a_guess_with_nothing_random_in_it_has_as_many_starts_as_it_has_curves(revolutions, allowed, tried):
+    hopeless = Solver(guess=PolarTransfer(revolutions), n_starts=allowed, start_limit=1e-300, continuation=Single())
+    result = hopeless.solve(problem("earth_mars"))
+    assert result.n_starts == tried
+    assert {stage.start for stage in result.stages} == set(range(tried))
+
+
+@pytest.mark.slow
+def test_of_several_numbers_of_revolutions_the_cheapest_is_kept():
+    solver = Solver(
+        basis=Legendre(14),
+        conditioning="orthonormal",
+        n_nodes=20,
+        n_segments=12,
+        guess=PolarTransfer(revolutions=(2, 3, 5)),
+        n_certified=5,
+    )
+    result = solver.solve(PROBLEMS["earth_mars"](**EARTH_VENUS))
+    assert result.n_starts == 3
+    assert result.message.endswith("the cheapest of 3 certified starts")
+    assert result.solution.cost == pytest.approx(209.42204516, abs=1e-7)
+    costs = [stage.cost for stage in result.stages if stage.name == "split" and stage.cost > 0]
+    assert costs == pytest.approx([463.66754213, 209.42204516, 493.44313853], abs=1e-6)
+
+
 def test_a_solve_does_not_depend_on_those_before_it():
     """Tables and tapes are kept from solve to solve, but not those of weights that were changed since."""
     basis, fresh = RandomFeatures(30, "tanh"), RandomFeatures(30, "tanh", seed=7)
