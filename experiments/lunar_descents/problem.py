@@ -53,6 +53,8 @@ def vertical_fuel(height: float, speed: float, weights: float) -> float:
     def burn(fall: float) -> float:
         """How long the engine takes to stop what has fallen so long."""
         v = speed - GRAVITY * fall
+        if v >= 0:
+            return 0.0
         # the speed at the end grows with the burn as long as the thrust exceeds the weight
         return brentq(
             lambda s: v - GRAVITY * s - EXHAUST * math.log1p(-flow * s / MASS), 0.0, 0.999 * MASS / flow, xtol=1e-14
