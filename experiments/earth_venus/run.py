@@ -1,4 +1,4 @@
-"""Earth to Venus in 1000 days: what each number of revolutions of the guess leads to."""
+"""Earth to Venus in 1000 days: what each number of revolutions of the guess leads to, and what thrust it needs."""
 
 from __future__ import annotations
 
@@ -12,28 +12,30 @@ from typing import Any
 
 import torch
 
+from experiments.earth_venus.direct import least_thrust
 from experiments.solves import row
 from experiments.tables import Report, markdown, run_study
 from ponn_torch.ansatz.basis import Legendre
 from ponn_torch.problems.earth_mars import EARTH_VENUS, earth_mars
+from ponn_torch.solving.feasibility import check_control
 from ponn_torch.solving.paths import PolarTransfer
 from ponn_torch.solving.solution import Solution
 from ponn_torch.solving.solver import Solver
 
 FOLDER = Path(__file__).parent
 KNOWN_KG = {2: 463.66754, 3: 209.42204516, 4: 240.30443}  # by extra revolutions of the guess
-REVOLUTIONS = (1, 2, 3, 4)
+DIRECT_STARTS = 3
+REVOLUTIONS = (1, 2, 3, 4, 5, 6, 7)
 
 
 def solver(revolutions: int) -> Solver:
-    """What ``experiment=earth_venus`` says."""
+    """What ``experiment=earth_venus`` says; more segments where they would span more than a third of a revolution."""
     return Solver(
         basis=Legendre(14),
         conditioning="orthonormal",
         n_nodes=20,
-        n_segments=12,
+        n_segments=max(12, 3 * revolutions),
         guess=PolarTransfer(revolutions=revolutions),
-        n_starts=1,
     )
 
 
@@ -52,14 +54,25 @@ def transfers(revolutions: Sequence[int]) -> Report:
         solution, known = result.solution, KNOWN_KG.get(extra)
         found["revolutions"] = turns(solution) if solution is not None else math.nan
         found["switches"] = len(solution.switch_times) if solution is not None else 0
+        control = check_control(problem, solver(extra))
+        found["needs_N"] = math.nan if control is None or control.needed is None else control.needed
+        found["needs_cpu_s"] = math.nan if control is None else control.cpu_seconds
+        direct = [thrust for seed in range(DIRECT_STARTS) if (thrust := least_thrust(extra, seed)) is not None]
+        found["needs_directly_N"] = min(direct, default=math.nan)
         rows.append(found)
         print(f"{extra}: {found['fuel_kg']:.8f} kg, {found['cpu_s']:.2f} s, {result.message}", flush=True)
+        needs = {
+            "extra revolutions": extra,
+            "needs, N": "" if math.isnan(found["needs_N"]) else f"{found['needs_N']:.6f}",
+            "direct collocation, N": f"{found['needs_directly_N']:.6f} ({len(direct)}/{DIRECT_STARTS})",
+        }
         if result.certificate is None or not result.certified:
-            lines.append({"extra revolutions": extra, "certified": "no", "CPU s": f"{found['cpu_s']:.1f}"})
+            verdict = "infeasible" if control is not None and control.infeasible else "no"
+            lines.append({**needs, "certified": verdict, "CPU s": f"{found['cpu_s']:.1f}"})
             continue
         lines.append(
             {
-                "extra revolutions": extra,
+                **needs,
                 "certified": "yes",
                 "revolutions": f"{found['revolutions']:.3f}",
                 "switches": found["switches"],
@@ -69,7 +82,6 @@ def transfers(revolutions: Sequence[int]) -> Report:
                 "end, km": f"{found['end_error_r [km]']:.1e}",
                 "H drift": f"{found['hamiltonian_drift']:.1e}",
                 "off-node residual": f"{found['off_node_residual']:.1e}",
-                "starts": found["starts"],
                 "iterations": found["iterations"],
                 "CPU s": f"{found['cpu_s']:.1f}",
             }
@@ -80,6 +92,7 @@ def transfers(revolutions: Sequence[int]) -> Report:
         measured[f"{key} certified"] = float(found["certified"])
         if found["extra_revolutions"] in KNOWN_KG:
             measured[f"{key} fuel − known, kg"] = abs(found["fuel_kg"] - KNOWN_KG[found["extra_revolutions"]])
+        measured[f"{key} needs − directly, N"] = abs(found["needs_N"] - found["needs_directly_N"])
     header = max(lines, key=len)
     return Report({"transfers": rows}, markdown([{**dict.fromkeys(header, ""), **line} for line in lines]), measured)
 

@@ -21,7 +21,7 @@ from ponn_torch.solving.solution import Solution
 from ponn_torch.solving.solver import Solver
 from ponn_torch.solving.split import Split
 
-ROOT = "root_of_the_multiple"  # the least-control twin's further state
+MULTIPLE = "multiple_of_the_bounds"  # the least-control twin's further state
 
 
 @dataclass(frozen=True)
@@ -118,9 +118,9 @@ def minimum_time_twin(problem: OptimalControlProblem) -> OptimalControlProblem:
 def least_control_twin(problem: OptimalControlProblem) -> OptimalControlProblem:
     """The same dynamics, ends and time, with the control's bounds multiplied by a constant, the least that will do.
 
-    A further state, free at both ends, is the root of the multiple, as a negative one would make an engine a source of
-    propellant. The multiple is paid once, so the unit of cost is a time unit's share of it; otherwise the smoothing,
-    which is paid all the time, would outweigh it.
+    The multiple is a further state, free at both ends. It is paid once, so the unit of cost is a time unit's share of
+    it; otherwise the smoothing, which is paid all the time, would outweigh it. An extremal with a negative multiple,
+    where an engine is a source of propellant, answers nothing.
 
     Raises:
         ValueError: a control without bounds, or whose bounds exclude zero, so that they cannot shrink towards it.
@@ -133,21 +133,21 @@ def least_control_twin(problem: OptimalControlProblem) -> OptimalControlProblem:
         raise ValueError(f"{problem.name}: {law.name} from {low:g} to {high:g}; allowed: bounds that include zero")
 
     def dynamics(t: Tensor, x: Named, u: Named, p: Named) -> dict[str, Tensor]:
-        multiple = getattr(x, ROOT).square()
+        multiple = getattr(x, MULTIPLE)
         enlarged = Named(**{name: multiple * value for name, value in vars(u).items()})
-        return {**problem.dynamics(t, x, enlarged, p), ROOT: torch.zeros_like(t)}
+        return {**problem.dynamics(t, x, enlarged, p), MULTIPLE: torch.zeros_like(t)}
 
     time = problem.time_guess
     return replace(
         problem,
         name=f"{problem.name}_least_control",
         description=f"{problem.description or problem.name}: with as little control as possible",
-        states={**problem.states, ROOT: 1},
+        states={**problem.states, MULTIPLE: 1},
         dynamics=dynamics,
         running_cost=None,
-        terminal_cost=lambda t, x, p: getattr(x, ROOT).square(),
-        units={**problem.units, ROOT: 1.0, "cost": problem.unit("time") / time},
-        costate_units={**_costate_units(problem, 1.0, time), ROOT: 1.0},
+        terminal_cost=lambda t, x, p: getattr(x, MULTIPLE),
+        units={**problem.units, MULTIPLE: 1.0, "cost": problem.unit("time") / time},
+        costate_units={**_costate_units(problem, 1.0, time), MULTIPLE: 1.0},
         cost_name="multiple of the bounds",
         known_cost=None,
         display={**problem.display, "cost": DisplayUnit("")},
@@ -228,7 +228,7 @@ def check_control(problem: OptimalControlProblem, solver: Solver, seed: int = 0)
     return ControlNeeded(
         name=law.name,
         allowed=allowed,
-        needed=None if solution is None else solution.cost * allowed,
+        needed=None if solution is None or solution.cost <= 0 else solution.cost * allowed,
         cpu_seconds=seconds,
         unit=problem.display.get(law.name, DisplayUnit("")),
     )
