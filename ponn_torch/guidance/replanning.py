@@ -75,7 +75,7 @@ class Fleet:
         problem = self.bvp.problem
         initial = {name: states[where] for name, where in problem.slices.items()}
         bvp = replace(self.bvp, problem=problem.with_boundary(initial=initial), known_initial=made.known_knots[0])
-        moved = replace(made, discretisation=made.discretisation.between(bvp), known_times=made.known_times - start)
+        moved = replace(made, discretisation=made.discretisation.serving(bvp), known_times=made.known_times - start)
         unknowns = made.unpack(curve.xi)
         xi = moved.pack(replace(unknowns, times=unknowns.times - start))
         refined = Split(n_segments=self.restart.segmentation.n_segments, max_sharpenings=0).run(type(curve)(moved, xi))

@@ -2,13 +2,13 @@
 
 On a few hundred numbers an operation costs a microsecond or two, and what leads to it (Python, autograd, shapes) more.
 A tape is the list of operations that one evaluation ran, derivatives included, without what constants alone decide,
-what changes nothing (times one, plus zero), what is computed twice and what nobody reads; views of views become one. It is
-played as straight-line Python, and gives the same bits for finite numbers, but for the sign of a zero.
+what changes nothing (times one, plus zero), what is computed twice and what nobody reads; views of views become one. It
+is played as straight-line Python, and gives the same bits for finite numbers, but for the sign of a zero.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from types import BuiltinFunctionType, MethodDescriptorType
 from typing import Any, cast
@@ -54,6 +54,10 @@ class Tape:
         raise Unrecordable("played back, the operations give something else")
 
 
+def finite(tensors: Sequence[Tensor]) -> bool:
+    return all(bool(torch.isfinite(x).all()) for x in tensors)
+
+
 def same(one: Sequence[Tensor], other: Sequence[Tensor]) -> bool:
     """Bit for bit: a run that goes on from a tape is the run that went on without."""
     pairs = list(zip(one, other, strict=True))
@@ -85,12 +89,13 @@ RECORDING_PAYS = 24  # calls: a recording takes about as long as a tape then has
 class Replay:
     """A function that is evaluated as it is until a recording pays, and played from its tape from then on.
 
-    A tape is held against the call before its recording; what cannot be recorded is evaluated as ever.
+    A tape is held against the call before its recording, both of them at finite numbers; what cannot be recorded is
+    evaluated as ever.
     """
 
     def __init__(self, after: int = RECORDING_PAYS) -> None:
-        self._before, self._tape = after, cast(Tape | None, None)
-        self._seen: tuple[tuple[Tensor, ...], tuple[Tensor, ...]] = (), ()
+        self._before, self._over, self._tape = after, False, cast(Tape | None, None)
+        self._seen = cast(tuple[tuple[Tensor, ...], tuple[Tensor, ...]] | None, None)
 
     @property
     def recorded(self) -> bool:
@@ -100,22 +105,25 @@ class Replay:
         """``function()``, which reads the inputs and, in every call, the same constants."""
         if self._tape is not None:
             return self._tape.play(*inputs)
-        before = self._before = self._before - 1
-        if before == 1:
-            expected = function()
-            self._seen = inputs, expected
-            return expected
-        (given, expected) = seen = self._seen
-        if before > 0 or not seen[0]:  # another thread may record it, or be about to
+        self._before -= 1
+        if self._over or self._before > 1:
             return function()
-        self._seen = (), ()
+        seen, self._seen = self._seen, None
+        if seen is None:
+            expected = function()
+            self._seen = (inputs, expected) if finite(expected) else None
+            return expected
+        self._over = True  # whatever comes of it; nor does another thread record it meanwhile
         try:
             tape = Tape.record(function, inputs)
         except Unrecordable:
             return function()
-        if same(tape.play(*given), expected):
+        results = tape.play(*inputs)
+        if not finite(results):
+            self._over, self._seen = False, seen
+        elif same(tape.play(*seen[0]), seen[1]):
             self._tape = tape
-        return tape.play(*inputs)
+        return results
 
 
 # -- recording -------------------------------------------------------------------------------------------------------
@@ -290,7 +298,7 @@ class _Writer:
             self.steps.append(_Step(text, reads, [], self.root[self.names[id(args[0])]]))
             return
         own = not changed.isdisjoint(map(storage, out))
-        if not own and (not varies or name in _FILLERS or self._vanishes(name, args)):
+        if not own and (not varies or name in _FILLERS or self._is_constant(name, args, out)):
             return  # always the same: captured where it is read
         if not own and any(self._goes_by(x, out[0], changed) for x in self._unchanged(name, args, kwargs)):
             return
@@ -311,18 +319,20 @@ class _Writer:
             self.known[text] = made
 
     def _fixed(self, x: Any, value: float) -> bool:
-        """Whether an argument is this number everywhere and always."""
+        """Whether an argument is a constant, and this number everywhere."""
         if isinstance(x, Tensor):
             return self.names.get(id(x)) not in self.root and bool((x == value).all())
         return not isinstance(x, bool) and isinstance(x, int | float) and x == value
 
-    def _vanishes(self, name: str, args: Any) -> bool:
-        """Whether a result is zero, or one, whatever varies: that is taken to be finite."""
+    def _is_constant(self, name: str, args: Any, out: list[Tensor]) -> bool:
+        """Whether a result is zero, or one, whatever varies: that is taken to stay finite."""
         if name == "mul":
-            return self._fixed(args[0], 0.0) or self._fixed(args[1], 0.0)
-        if name == "where":
-            return self._fixed(args[1], 0.0) and self._fixed(args[2], 0.0)
-        return name == "pow" and self._fixed(args[1], 0.0)
+            fixed = self._fixed(args[0], 0.0) or self._fixed(args[1], 0.0)
+        elif name == "where":
+            fixed = self._fixed(args[1], 0.0) and self._fixed(args[2], 0.0)
+        else:
+            fixed = name == "pow" and self._fixed(args[1], 0.0)
+        return fixed and finite(out)
 
     def _unchanged(self, name: str, args: Any, kwargs: Any) -> list[Tensor]:
         """Arguments that an operation leaves as they are, but for the sign of a zero: times one, plus zero."""
@@ -364,9 +374,18 @@ class _Writer:
         self.known[text] = [self._name(x, root=root)]
         self.steps.append(_Step(text, [root], self.known[text]))
 
+    def _returned(self, results: Sequence[Tensor]) -> Iterator[str]:
+        """Results as source text; what is an input, a constant or another result is a copy, to be its owner's."""
+        given = set(self.arguments)
+        for x in results:
+            name = self._source(x)
+            root = self.root.get(name)
+            yield f"{name}.clone()," if root is None or root in given else f"{name},"
+            given.update([root] if root else [])
+
     def tape(self, results: Sequence[Tensor]) -> Tape:
         """The lines that the results need, each name forgotten after its last use."""
-        returned = f"return {self._source(tuple(results))}"
+        returned = f"return [{''.join(self._returned(results))}]"
         needed = {self.names[id(x)] for x in results}
         needed |= {self.root[name] for name in needed if name in self.root}
         alive, lines, count = set(needed), [returned], 0

@@ -57,6 +57,7 @@ SCALINGS = {"marquardt": marquardt, "more": more, "identity": identity}
 
 
 AHEAD = 0.1  # of a step, where the curvature along it is read off
+HELPS = 0.5  # of ‖r‖, which a step with an old Jacobian has to leave at most, or it is taken back for a new one
 
 # -- Levenberg–Marquardt ---------------------------------------------------------------------------------------------
 
@@ -143,14 +144,14 @@ class LevenbergMarquardt(Driven):
         cost, tiny = r.square().sum(-1), torch.finfo(xi.dtype).tiny
         step = jacobian.solve_damped(r, state.damping, scale, self.linear_solver)
         trial = xi + step
-        if self.geodesic:
+        fresh = formed_at is not None and torch.equal(formed_at, xi)
+        if self.geodesic and fresh:
             ahead = residual.residual(xi + AHEAD * step)
             # J a = −r_vv, the second derivative of r along the step v
             curvature = (2 / AHEAD) * ((ahead - r) / AHEAD - jacobian.apply(step))
             half = jacobian.solve_damped(0.5 * curvature, state.damping, scale, self.linear_solver)
             short = 2 * (scale * half).norm(dim=-1) <= 0.75 * (scale * step).norm(dim=-1)  # NaN is not short
             trial = trial + torch.where(short.unsqueeze(-1), half, 0.0)
-        fresh = formed_at is not None and torch.equal(formed_at, xi)
         # close to a solution Newton's contraction is squared from step to step, that of an old Jacobian stays
         promised = state.contraction**2 if fresh else state.contraction
         if self.ahead and cost.numel() == 1 and not bool(promised <= self.reuse):
@@ -159,6 +160,9 @@ class LevenbergMarquardt(Driven):
             trial_r, following = residual.residual(trial), None
         trial_cost = trial_r.square().sum(-1)
         accepted = running & (trial_cost < cost)  # NaN compares false: a non-finite step is rejected
+        contraction = torch.where(accepted, (trial_cost / cost).sqrt(), 1.0)
+        if not fresh and bool((contraction > HELPS)[running].any()):
+            return self.step(residual, replace(state, formed_at=None, jacobian=None), running)
         # ‖r‖² − ‖r + J p‖² for the exact solution of the damped system
         predicted = (step * (state.damping.unsqueeze(-1) * scale.square() * step - jacobian.gradient(r))).sum(-1)
         gain = (cost - trial_cost) / predicted.clamp_min(tiny)
@@ -173,16 +177,16 @@ class LevenbergMarquardt(Driven):
                 Status.DAMPING: ~accepted & (damping >= self.largest_damping),
             },
         )
-        contraction = torch.where(accepted, (trial_cost / cost).sqrt(), 1.0)
+        kept: tuple[Tensor | None, Jacobian | None] = formed_at, jacobian
         if not bool(accepted.any()):
-            # a rejected step is tried again, shorter; with an old Jacobian it says nothing
-            kept = (formed_at, jacobian) if fresh else (None, None)
+            pass  # tried again, shorter
         elif following is not None:
             xi, r, kept, scale = trial, trial_r, (trial, following), self._scale(following, scale)
         else:
             where = accepted.unsqueeze(-1)
             xi, r = torch.where(where, trial, xi), torch.where(where, trial_r, r)
-            kept = (formed_at, jacobian) if bool((contraction <= self.reuse)[running].all()) else (None, None)
+            if not bool((contraction <= self.reuse)[running].all()):
+                kept = None, None
         return DampedState(xi, r, scale, damping, growth, contraction, *kept), move
 
     def _scale(self, jacobian: Jacobian, previous: Tensor | None) -> Tensor:

@@ -80,8 +80,9 @@ class Collocation:
         events = tuple(events) if events is not None else (None,) * (n_segments - 1)
         knots = torch.full((n_segments + 1, bvp.dimension), torch.nan, dtype=times.dtype, device=times.device)
         knots[0], knots[-1] = bvp.known_initial, bvp.known_final
-        if setting is None:
-            setting = Setting(parameters={k: times.new_tensor(v) for k, v in bvp.problem.parameters.items()})
+        setting = setting or Setting()
+        missing = {k: times.new_tensor(v) for k, v in bvp.problem.parameters.items() if k not in setting.parameters}
+        setting = replace(setting, parameters={**missing, **setting.parameters})
         return cls(discretisation, knots, times, setting, events)
 
     def with_setting(self, *, smoothing: float | Tensor | None = None, **parameters: float | Tensor) -> Collocation:

@@ -81,10 +81,11 @@ class Curve:
         """ẇ − F at scaled times off the nodes, about n_points a segment: (t (K·n,), (K·n, 2n))."""
         made = self.collocation
 
-        def values() -> tuple[Tensor, ...]:
-            fresh = Curve(made, self.xi)  # whose unknowns are read off ξ here
-            t, w, rate, segment = fresh.on_segments(made.discretisation.nodes.between(n_points))
-            return t, rate - made.bvp.rates(t[:, None], w, fresh.setting(segment))
+        def values() -> tuple[Tensor, Tensor]:
+            t, w, rate = made.on_each(made.unpack(self.xi), made.discretisation.nodes.between(n_points))
+            index = torch.arange(len(t), device=t.device).repeat_interleave(t.shape[-1])
+            t, w, rate = t.flatten(), w.flatten(0, 1), rate.flatten(0, 1)
+            return t, rate - made.bvp.rates(t[:, None], w, self.setting(index))
 
         t, defect = made.replayed(f"defect at {n_points}", values, self.xi)
         return t, defect

@@ -117,10 +117,16 @@ class Discretisation:
     conditioning: str = "orthonormal"
     combinations: Mapping[int, Tensor] = field(default_factory=dict)
 
-    def between(self, bvp: BoundaryValueProblem) -> Discretisation:
-        """The same tables and tapes for another boundary value problem of the same ``equations``."""
+    def serving(self, bvp: BoundaryValueProblem) -> Discretisation:
+        """The same tables and tapes for another boundary value problem of the same ``equations``.
+
+        Raises:
+            ValueError: its equations are others.
+        """
         if bvp is self.bvp:
             return self
+        if bvp.equations != self.bvp.equations:
+            raise ValueError(f"{bvp.problem.name}: its equations are not those of {self.bvp.problem.name}")
         for name, member in vars(Discretisation).items():
             if isinstance(member, cached_property):  # to be in the copy, it has to be there
                 getattr(self, name)
@@ -233,7 +239,7 @@ def discretise(
     if isinstance(basis, LinearBasis) and not dict(basis.named_buffers()):
         basis = _made_once(type(basis), tuple(basis.arguments.items()))
     weights = tuple((id(x), x._version) for x in (*basis.parameters(), *basis.buffers()))
-    return _discretise(Keyed(bvp.equations, bvp), basis, nodes, form, conditioning, weights).between(bvp)
+    return _discretise(Keyed(bvp.equations, bvp), basis, nodes, form, conditioning, weights).serving(bvp)
 
 
 @lru_cache(maxsize=64)

@@ -137,7 +137,7 @@ class Measured:
     Every segment has a further row for every measurement, zero where that lies in another one.
 
     Raises:
-        ValueError: a name that is no component of states or costates, or no time within the flight.
+        ValueError: a name that is no component of states or costates, or no time from the start on.
     """
 
     collocation: Collocation
@@ -187,7 +187,9 @@ class Measured:
     def _deviations(self, xi: Tensor, segment: Tensor) -> Tensor:
         """√w (x − y) (M,), scaled."""
         curve, (t, column, y, root) = Curve(self.collocation, xi), self._rows
-        inside = torch.minimum(torch.maximum(t, curve.times[segment]), curve.times[segment + 1])
+        start, end = curve.times[segment], curve.times[segment + 1]
+        # not by minimum and maximum, which would halve the slope where a time is that of a knot
+        inside = torch.where(t < start, start, torch.where(t > end, end, t))
         physical = torch.cat(self.collocation.bvp.to_physical(curve.at(inside, segment)), -1) / self._sizes
         return root * (physical.gather(-1, column[:, None])[:, 0] - y)
 

@@ -54,6 +54,8 @@ class BoundaryValueProblem:
         exponent (n,): 0 for x = unit·y; ±1 for x = unit·exp(±y).
         conjugate (n,): c = costate unit × state unit.
         known_initial, known_final: (2n,) scaled values, NaN where unknown.
+        couplings: boolean (2n, 2n), F_i depends on w_j.
+        statement: what the problem says but for its ends and values of parameters; see ``meaning``.
     """
 
     problem: OptimalControlProblem
@@ -66,14 +68,20 @@ class BoundaryValueProblem:
     cost_unit: float
     known_initial: Tensor
     known_final: Tensor
+    couplings: Tensor
+    statement: Hashable
     n_multipliers: int = 0
     chains: tuple[Chain, ...] = ()
 
     @cached_property
-    def equations(self) -> Hashable:
-        """Equal for boundary value problems that differ in nothing but values at the ends and of parameters."""
-        of_states = self.unit.dtype, self.unit.device, self.mass_variable
-        return _statement(self.problem), *of_states, meaning(self.law), meaning(self.chains)
+    def equations(self) -> tuple[Hashable, ...]:
+        """Equal for boundary value problems that differ in nothing but values at the ends and of parameters.
+
+        What was found by probes, at the values that the parameters had, has to be the same too.
+        """
+        tensors = (self.unit, self.exponent, self.conjugate, self.couplings)
+        found = meaning([self.law, self.chains, *tensors], self.problem)
+        return self.statement, found, self.unit.device
 
     # -- scaling -----------------------------------------------------------------------------------------------
 
@@ -187,14 +195,6 @@ class BoundaryValueProblem:
         value, (by_t, by_w) = pointwise_jacobian(rates, rows, t, w, constants=varied)
         return value, by_t[..., 0], by_w
 
-    @cached_property
-    def couplings(self) -> Tensor:
-        """Boolean (2n, 2n): F_i depends on w_j, found at random points."""
-        t, w = probe_points(self, 16, seed=1)
-        rows = range(self.dimension)
-        slopes = [self.linearised_rates(t, w, setting, rows)[2] for setting in probe_settings(self, t)]
-        return (torch.stack(slopes) != 0).any(0).any(0)  # NaN counts: nothing says that it does not depend
-
     def switching(self, t: Tensor, w: Tensor, setting: Setting) -> Tensor:
         """Switching functions (..., m), positive where more control is better."""
         return self.minimiser(t, w, setting).switching
@@ -283,8 +283,8 @@ def pontryagin(
 ) -> BoundaryValueProblem:
     """Derive the boundary value problem; ``mass_variable`` is one of MASS_VARIABLES, ``chains`` merges ṙ = v.
 
-    What is derived for a problem serves all that say the same but for their ends (``equations``): its functions must go
-    on to compute the same. What is to vary belongs into ``parameters``, or into another problem.
+    What is derived for a problem serves all that say the same but for their ends (``equations``), whose functions then
+    must compute what they did: an object that they read is not to be changed in place.
 
     ``auto`` takes the logarithm of a mass where the problem names one: it keeps the mass positive, which decides
     whether a random start converges (Earth–Mars: 16 of 16 against 9 of 16 with the mass itself).
@@ -292,10 +292,12 @@ def pontryagin(
     Raises:
         ValueError: unknown mass variable, or one asked of a problem that names no mass.
     """
-    stated = Keyed((_statement(problem), meaning(problem.parameters)), problem)
+    stated = Keyed((_statement(problem), meaning(problem.parameters, problem)), problem)
     with torch.no_grad():
-        bvp = replace(_derive(stated, mass_variable, chains, dtype, device), problem=problem)
-        return replace(bvp, **_boundary(bvp))
+        bvp = replace(_derive(stated, mass_variable, chains), problem=problem)
+        bvp = replace(bvp, **_boundary(bvp))
+        tensors = ("unit", "exponent", "conjugate", "known_initial", "known_final")
+        return replace(bvp, **{name: getattr(bvp, name).to(dtype=dtype, device=device) for name in tensors})
 
 
 def _statement(problem: OptimalControlProblem) -> Hashable:
@@ -304,7 +306,7 @@ def _statement(problem: OptimalControlProblem) -> Hashable:
     functions = (problem.dynamics, problem.running_cost, problem.terminal_cost, problem.terminal_manifold)
     rest = (problem.states, problem.control, problem.mass, problem.exhaust_velocity, problem.free_final_time)
     units = (problem.units, problem.costate_units, list(problem.parameters))
-    return meaning([*functions, *rest, *units, known])
+    return meaning([*functions, *rest, *units, known], problem)
 
 
 @lru_cache(maxsize=16)
@@ -312,9 +314,8 @@ def _derive(
     stated: Keyed[OptimalControlProblem],
     mass_variable: str,
     chains: bool,
-    dtype: torch.dtype,
-    device: torch.device | str,
 ) -> BoundaryValueProblem:
+    """All but the ends, in float64, which probes need whatever the solver's precision."""
     problem = stated.value
     if mass_variable not in MASS_VARIABLES:
         raise ValueError(f"mass_variable = {mass_variable!r}; {nearest(mass_variable, MASS_VARIABLES)}")
@@ -323,7 +324,6 @@ def _derive(
     if mass_variable != "mass" and problem.mass is None:
         raise ValueError(f"mass_variable = {mass_variable!r}, but problem {problem.name!r} names no mass")
 
-    # what is derived by probing needs float64, whatever the solver's precision
     def tensor(values: list[float]) -> Tensor:
         return torch.tensor(values, dtype=torch.float64)
 
@@ -345,11 +345,11 @@ def _derive(
         cost_unit=float(problem.units.get("cost", 1.0)),
         known_initial=tensor([]),
         known_final=tensor([]),
+        couplings=tensor([]),
+        statement=stated.key[0],
     )
     bvp = replace(bvp, law=_adapted_law(bvp), n_multipliers=_n_multipliers(bvp))
-    bvp = replace(bvp, chains=find_chains(bvp) if chains else _single_chains(bvp))
-    tensors = ("unit", "exponent", "conjugate")
-    return replace(bvp, **{name: getattr(bvp, name).to(dtype=dtype, device=device) for name in tensors})
+    return replace(bvp, chains=find_chains(bvp) if chains else _single_chains(bvp), couplings=_couplings(bvp))
 
 
 def _boundary(bvp: BoundaryValueProblem) -> dict[str, Any]:
@@ -426,6 +426,14 @@ def _adapted_law(bvp: BoundaryValueProblem) -> ControlSet:
         return bvp._hamiltonian(t * bvp.time_unit, x, costates, Named(**u), p)[0]
 
     return bvp.law.adapted(h, cost, p, t, bvp.cost_unit / bvp.time_unit)
+
+
+def _couplings(bvp: BoundaryValueProblem) -> Tensor:
+    """Boolean (2n, 2n): F_i depends on w_j, found at random points."""
+    t, w = probe_points(bvp, 16, seed=1)
+    rows = range(bvp.dimension)
+    slopes = [bvp.linearised_rates(t, w, setting, rows)[2] for setting in probe_settings(bvp, t)]
+    return (torch.stack(slopes) != 0).any(0).any(0)  # NaN counts: nothing says that it does not depend
 
 
 def _single_chains(bvp: BoundaryValueProblem) -> tuple[Chain, ...]:

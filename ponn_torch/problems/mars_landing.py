@@ -68,7 +68,7 @@ def mars_landing(
     cosine = math.cos(math.radians(cant_angle_degrees))
     alpha = mass_flow_per_thrust or 1.0 / (specific_impulse * standard_gravity * cosine)
     # a power of two: landings from about as high up then have the same scaled equations, which are derived once
-    length = 2.0 ** round(math.log2(max(math.hypot(*initial_position), 1.0)))
+    length = math.ldexp(1.0, math.frexp(max(math.hypot(*initial_position), 1.0))[1])
     speed = length / final_time
 
     def dynamics(t: torch.Tensor, x: Named, u: Named, p: Named) -> dict[str, torch.Tensor]:

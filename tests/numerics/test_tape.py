@@ -165,6 +165,32 @@ def test_a_view_is_not_taken_for_what_it_is_multiplied_to() -> None:
         assert torch.equal(played(t, x), function(t, x))
 
 
+def test_nothing_is_recorded_where_numbers_are_not_finite() -> None:
+    """There a product with zero is NaN, which must not be taken for a constant."""
+    replay = Replay(after=3)
+    values = [1.0, 2.0, 1000.0, 1000.0, 0.5, 1000.0, 0.7, 0.9, 1.1]
+    for value in values:
+        x = torch.full((2,), value, dtype=torch.float64)
+        (found,) = replay(lambda x=x: (torch.exp(x) * torch.zeros_like(x) + x,), x)
+        assert identical(found, torch.exp(x) * torch.zeros_like(x) + x) or replay.recorded
+        assert not replay.recorded or bool(torch.isfinite(found).all())
+    assert replay.recorded
+
+
+def test_results_belong_to_who_asked_for_them() -> None:
+    """What is an input, a constant or another result is copied."""
+    x = points()[0][1]
+    zero, one = torch.zeros_like(x), torch.ones_like(x)
+    tape = Tape.record(lambda: (x * one, x * zero, x + zero, torch.sin(x) * one, torch.sin(x)), (x,))
+    first, kept = tape.play(x), x.clone()
+    for result in first:
+        result.add_(5.0)
+    assert torch.equal(x, kept)
+    expected = (x, zero, x, torch.sin(x), torch.sin(x))
+    assert all(torch.equal(found, value) for found, value in zip(tape.play(x), expected, strict=True))
+    assert all(torch.equal(found, value + 5.0) for found, value in zip(first, expected, strict=True))
+
+
 def test_results_are_not_shared_between_plays() -> None:
     played = taped(filled, *points()[0])
     first = played(*points()[0])

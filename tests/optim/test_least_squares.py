@@ -265,6 +265,17 @@ def test_an_old_jacobian_that_does_not_help_is_formed_anew(start):
     assert bool((result.xi.abs() < 1e-12).all())
 
 
+def test_a_poor_step_with_an_old_jacobian_counts_for_nothing():
+    """It is taken back for one with a new Jacobian: neither a slow step nor a rejected one, in no member of a batch."""
+    xi = torch.tensor([[0.1], [-1.3], [0.7]], dtype=torch.float64)
+    stopping = Stopping(tolerance=1e-12, decrease=0.1, patience=1)
+    result = LevenbergMarquardt(stopping, damping=1e-12, reuse=0.9).run(_ArcTangent(), xi)
+    assert result.status is Status.RESIDUAL
+    norms = [record["norm"] for record in result.records]
+    assert norms == sorted(norms, reverse=True)
+    assert all(record["damping"] <= 1e-12 for record in result.records)
+
+
 def test_iteration_limit():
     residual, start = start_of("rosenbrock")
     result = LevenbergMarquardt(Stopping(max_iterations=3)).run(residual, start)

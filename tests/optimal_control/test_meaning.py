@@ -3,20 +3,24 @@
 from __future__ import annotations
 
 import math
+import sys
+from collections import defaultdict
 from collections.abc import Callable, Hashable
 from dataclasses import dataclass, replace
 from functools import partial
-from types import MappingProxyType
+from types import MappingProxyType, ModuleType
 
 import numpy as np
 import pytest
 import torch
 from helpers import PROBLEMS
 
-from ponn_torch.optimal_control.control_laws import ThrustBall
+from ponn_torch.numerics.tape import RECORDING_PAYS
+from ponn_torch.optimal_control.collocation import Collocation
+from ponn_torch.optimal_control.control_laws import Regime, ThrustBall
 from ponn_torch.optimal_control.discretisation import discretise
-from ponn_torch.optimal_control.meaning import LARGE, Keyed, meaning
-from ponn_torch.optimal_control.pontryagin import pontryagin
+from ponn_torch.optimal_control.meaning import LARGE, MOST, Keyed, meaning
+from ponn_torch.optimal_control.pontryagin import Setting, pontryagin, probe_points
 from ponn_torch.solving.solver import Solver
 
 
@@ -84,9 +88,12 @@ PAIRS = [
 ]
 
 
-def key(value: object) -> Hashable:
-    found = meaning(value)
-    assert hash(found) == hash(meaning(value))
+OWNER, ANOTHER = object(), object()
+
+
+def key(value: object, owner: object = OWNER) -> Hashable:
+    found = meaning(value, owner)
+    assert hash(found) == hash(meaning(value, owner))
     return found
 
 
@@ -103,16 +110,135 @@ def test_functions_of_other_code_mean_something_else():
     assert key(captures(1)) != key(by_default(1))
 
 
-def test_what_cannot_be_looked_into_is_itself_alone():
-    class Mutable:
-        pass
+class Mutable:
+    value = 1.0
 
-    one, other = Mutable(), Mutable()
-    large = np.zeros(LARGE // 8 + 1)
-    weights = torch.nn.Parameter(torch.zeros(2))
-    for value, copy in ((one, other), (large, large.copy()), (weights, torch.nn.Parameter(torch.zeros(2)))):
-        assert key(captures(value)) == key(captures(value))
-        assert key(captures(value)) != key(captures(copy))
+    def at(self, x: float) -> float:
+        return self.value * x
+
+
+class Tagged(ThrustBall):
+    """A frozen dataclass, and something besides."""
+
+
+def tagged() -> Tagged:
+    made = Tagged("thrust", 1.0)
+    object.__setattr__(made, "tag", 1)
+    return made
+
+
+class Float(float):
+    pass
+
+
+OPAQUE = {
+    "instance": Mutable(),
+    "method of an instance": Mutable().at,
+    "class": Mutable,
+    "module": torch.nn.Linear(1, 1),
+    "parameter": torch.nn.Parameter(torch.zeros(2)),
+    "followed by autograd": torch.zeros(2, requires_grad=True),
+    "large array": np.zeros(LARGE // 8 + 1),
+    "large tensor": torch.zeros(LARGE // 8 + 1, dtype=torch.float64),
+    "bfloat16": torch.zeros(2, dtype=torch.bfloat16),
+    "sparse": torch.eye(2).to_sparse(),
+    "masked": np.ma.array([1.0, 2.0], mask=[False, True]),
+    "objects": np.array([object()]),
+    "more than its fields": tagged(),
+    "subclass of a number": Float(1.0),
+    "default": defaultdict(list),
+    "iterator": iter([1, 2]),
+}
+
+
+@pytest.mark.parametrize("name", OPAQUE)
+def test_what_cannot_be_looked_into_stands_for_its_owner(name):
+    """The same problem shares with itself, another one shares nothing, whatever became of the object."""
+    for way in WAYS.values():
+        assert key(way(OPAQUE[name])) == key(way(OPAQUE[name]))
+        assert key(way(OPAQUE[name])) != key(way(OPAQUE[name]), ANOTHER)
+
+
+def test_what_would_take_too_long_to_look_through_stands_for_its_owner():
+    assert key(captures(list(range(MOST + 1)))) != key(captures(list(range(MOST + 1))), ANOTHER)
+
+
+def test_other_views_of_numbers_are_told_by_their_content():
+    base = torch.tensor([[1.0 + 1.0j, 2.0 - 1.0j], [3.0 + 0.5j, 4.0 - 2.0j]])
+    assert key(captures(base.mT)) == key(captures(base.mT.contiguous()))
+    assert key(captures(base.conj())) == key(captures(base.conj().resolve_conj()))
+    assert key(captures(base.conj())) != key(captures(base))
+
+
+def test_what_holds_itself_is_looked_through_once():
+    one: list[object] = [1]
+    one.append(one)
+    other: list[object] = [1]
+    other.append(other)
+    assert key(captures(one)) == key(captures(other))
+
+
+SOURCE = """
+import math
+import torch
+from other_module import scale
+
+GRAVITY = 9.8
+def helper(x): return GRAVITY * x
+def function(x): return torch.sqrt(helper(x)) * math.pi * scale(x)
+def unrelated(x): return x
+"""
+
+
+def module(name: str, source: str) -> ModuleType:
+    made = ModuleType(name)
+    made.__file__ = f"{name}.py"
+    exec(compile(source, made.__file__, "exec"), vars(made))
+    return made
+
+
+@pytest.fixture
+def modules(monkeypatch):
+    """A user's file that is run twice, with a module that it imports from."""
+
+    def twice(source: str = SOURCE, factor: float = 1.0) -> ModuleType:
+        monkeypatch.setitem(sys.modules, "other_module", module("other_module", f"def scale(x): return {factor} * x"))
+        return module("stated", source)
+
+    return twice
+
+
+def test_a_file_that_is_run_again_says_the_same(modules):
+    one, other = modules(), modules()
+    assert one.function is not other.function
+    assert key(one.function) == key(other.function, ANOTHER)
+
+
+def test_a_global_that_changed_is_seen_where_it_is_read(modules):
+    one = modules()
+    before, apart = key(one.function), key(one.unrelated)
+    one.GRAVITY = 1.6
+    assert key(one.function) != before
+    assert key(one.unrelated) == apart
+    assert key(modules(SOURCE.replace("9.8", "1.6")).function) == key(one.function)
+
+
+def test_a_function_of_another_module_is_looked_into(modules):
+    assert key(modules().function) != key(modules(factor=2.0).function)
+
+
+def test_what_is_read_from_a_module_counts():
+    constants = module("constants", "G = 1.0")
+    source = "import constants\ndef function(x): return constants.G * x"
+    sys.modules["constants"] = constants
+    try:
+        stated = module("stated", source)
+        before = key(stated.function)
+        assert key(module("stated", source).function) == before
+        constants.G = 2.0  # type: ignore[attr-defined]
+        assert key(stated.function) != before
+    finally:
+        del sys.modules["constants"]
 
 
 def test_a_list_that_was_changed_means_something_else():
@@ -127,16 +253,16 @@ def test_a_name_without_a_value_yet_is_told_apart():
         def function() -> float:
             return later
 
-        before = meaning(function)
+        before = meaning(function, OWNER)
         later = 1.0
-        assert meaning(function) != before
+        assert meaning(function, OWNER) != before
         return function
 
     assert key(make()) == key(make())
 
 
 def test_keys_stand_for_values():
-    assert Keyed((1, "a"), object()) == Keyed((1, "a"), object())
+    assert Keyed((1, "a"), "one") == Keyed((1, "a"), "other")
     assert Keyed((1, "a"), 1) != Keyed((1, "b"), 1)
 
 
@@ -181,6 +307,65 @@ def test_a_free_end_is_another_problem_than_a_known_one():
     made = PROBLEMS["mars_landing"]()
     freed = replace(made, final={"r": made.final["r"]})
     assert pontryagin(freed).equations != pontryagin(made).equations
+
+
+def test_a_problem_whose_global_changed_is_another_one(modules):
+    """The certificate would refuse what is solved with the equations from before."""
+    source = """
+GRAVITY = 9.8
+def cart(problem):
+    from dataclasses import replace
+    def dynamics(t, x, u, p):
+        return {"x": x.v, "v": u.force - GRAVITY * x.x}
+    return replace(problem, dynamics=dynamics)
+"""
+    made = PROBLEMS["minimum_time"]()
+    stated = modules(source)
+    before = pontryagin(stated.cart(made))
+    assert pontryagin(stated.cart(made)).equations == before.equations
+    stated.GRAVITY = 1.6
+    after = pontryagin(stated.cart(made))
+    assert after.equations != before.equations
+    t, w = probe_points(after, 3)
+    setting = Setting(Regime(0.3 + t))
+    assert torch.equal(Solver().discretisation(after).bvp.rates(t, w, setting), after.rates(t, w, setting))
+
+
+def test_parameters_that_a_setting_leaves_out_are_the_problems():
+    """They are data of a tape, not constants in it."""
+    made = []
+    for thrust in (13e3, 20e3):
+        bvp = pontryagin(PROBLEMS["mars_landing"](maximum_thrust=thrust))
+        disc, times = Solver().discretisation(bvp), torch.tensor([0.0, bvp.final_time], dtype=torch.float64)
+        setting = Setting(Regime(torch.tensor(3.0, dtype=torch.float64)))
+        made.append(Collocation.on_segments(disc, times, setting=setting))
+    xi = 0.1 * torch.ones(made[0].n_unknowns, dtype=torch.float64)
+    for _ in range(RECORDING_PAYS + 1):
+        made[0].residual(xi)
+    assert made[1].discretisation.replays is made[0].discretisation.replays
+    assert torch.equal(made[1].residual(xi), made[1]._residual(xi))
+    assert not torch.equal(made[1].residual(xi), made[0].residual(xi))
+
+
+def test_dependences_found_by_probes_are_part_of_the_equations():
+    """They may differ with the values of parameters: here F depends on r only where k is above 10."""
+
+    def stated(k: float):
+        made = PROBLEMS["minimum_time"]()
+
+        def dynamics(t, x, u, p):
+            return {"x": x.v, "v": u.force - torch.relu(p.k - 10.0) * torch.sin(x.x)}
+
+        return pontryagin(replace(made, dynamics=dynamics, parameters={**made.parameters, "k": k}))
+
+    assert stated(1.0).equations == stated(2.0).equations
+    assert stated(1.0).equations != stated(20.0).equations
+
+
+def test_a_discretisation_serves_no_other_equations():
+    one, other = (pontryagin(PROBLEMS["mars_landing"](gravity=g)) for g in (3.7, 1.6))
+    with pytest.raises(ValueError, match="its equations are not those of"):
+        Solver().discretisation(one).serving(other)
 
 
 def test_a_discretisation_serves_no_other_options():

@@ -1,5 +1,6 @@
 """Measurements as rows: exact Jacobians, exact data reproduced, noisy data pull, files in the units of a trajectory."""
 
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -12,8 +13,10 @@ from ponn_torch.optim.base import Stopping
 from ponn_torch.optim.least_squares import LevenbergMarquardt
 from ponn_torch.optim.quasi_newton import LBFGS
 from ponn_torch.optimal_control.collocation import component_names
+from ponn_torch.optimal_control.control_laws import Regime
 from ponn_torch.optimal_control.curve import Curve
 from ponn_torch.optimal_control.measurements import Measured, MeasurementFile, Measurements
+from ponn_torch.optimal_control.pontryagin import Setting
 from ponn_torch.solving.guess import RandomGuess, project
 from ponn_torch.solving.solution import Solution
 
@@ -69,6 +72,22 @@ def test_rows_of_measurements_are_exact():
     measured = Measured(made, sampled(made, xi, ["r_1", "m", "lambda_v_2"], noise=0.1))
     dense = measured.linearise(xi)[1].dense()
     assert relative(dense, jacrev(measured.residual)(xi)) < 1e-11
+
+
+def test_a_measurement_at_a_free_knot_has_the_slope_of_its_segment():
+    made = collocation(bvp_of("minimum_time"), n_segments=2)
+    made = replace(made, events=(0,), setting=Setting(Regime(arcs=torch.tensor([[2], [0]]))))
+    xi = random(made.n_unknowns, seed=3)
+    column, end = made.n_weights + len(made.free_knots), float(made.known_times[-1])
+    xi[column : column + 2] = torch.tensor([0.5 * end, end])  # the switch is at the measurement in the middle
+    measured, step = Measured(made, sampled(made, xi, ["x"], n=9, noise=0.1)), 1e-6
+    assert bool((measured._rows[0] == made.unpack(xi).times[1]).any())
+    before = xi.clone()
+    before[column] -= step  # the measurement stays in its segment
+    here = measured.residual(xi)[: -made.n_extra]
+    expected = (here - measured.residual(before)[: -made.n_extra]) / step
+    slope = measured.linearise(xi)[1].dense()[: -made.n_extra, column]
+    assert relative(slope, expected) < 1e-4
 
 
 def test_exact_data_change_nothing():
