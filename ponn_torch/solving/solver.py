@@ -274,8 +274,8 @@ class _Run:
         """The collocation of the first stage, and a start's guess projected on it."""
         like = self.bvp.unit
         share = torch.linspace(0.0, 1.0, self.solver.n_segments + 1, dtype=like.dtype, device=like.device)
-        collocation = Collocation.on_segments(self._discretisation(None), share * self.bvp.final_time)
-        if self._smoothable:
+        collocation = Collocation.on_segments(self.discretisation(None), share * self.bvp.final_time)
+        if self.smoothable:
             collocation = collocation.with_setting(smoothing=1.0)
         return collocation, project(collocation, self.solver.guess.curve(self.bvp, 1000 * self.seed + start))
 
@@ -299,93 +299,40 @@ class _Run:
 
     # -- smoothed stages ---------------------------------------------------------------------------------------------
 
-    def _discretisation(self, form: Form | None) -> Discretisation:
+    def discretisation(self, form: Form | None) -> Discretisation:
         key = form or self.solver.form
         if key not in self.discretisations:
             self.discretisations[key] = self.solver.discretisation(self.bvp, key)
         return self.discretisations[key]
 
     @property
-    def _smoothable(self) -> bool:
+    def smoothable(self) -> bool:
         return self.bvp.law.n_switching > 0 and not self.bvp.law.curved
 
     @property
-    def _reads_arcs(self) -> bool:
+    def reads_arcs(self) -> bool:
         return self.solver.refinement is not None and self.solver.refinement.reads_arcs
 
     @property
-    def _stage_optimizer(self) -> Optimizer:
+    def stage_optimizer(self) -> Optimizer:
         """A refinement that reads arcs solves everything anew: digits of the curve it starts from are wasted."""
         solver = self.solver
-        return loosened(solver.optimizer, solver.stage_tolerance) if self._reads_arcs else solver.optimizer
+        return loosened(solver.optimizer, solver.stage_tolerance) if self.reads_arcs else solver.optimizer
 
-    def _continuation(self, current: Collocation, xi: Tensor) -> tuple[list[Solution], str]:
+    def _continuation(self, collocation: Collocation, xi: Tensor) -> tuple[list[Solution], str]:
         """Walk the schedule from one start; the stages that can be trusted, the sharpest last, or none and why."""
-        solver = self.solver
-        kept: list[Solution] = []
-        message = ""
-        first, tries = True, 0
+        walk = _Walk(self, collocation, xi)
+        self.solver.continuation.run(walk)
+        return walk.kept, walk.message
 
-        def attempt(value: float, parameter: str, form: Form | None, *, hold: bool = False) -> Outcome:
-            nonlocal current, xi, message, first, tries
-            if self.clock.spent and not first:
-                return Outcome.ABORT
-            trial = replace(current, discretisation=self._discretisation(form))
-            if parameter != "smoothing" or self._smoothable:
-                trial = trial.with_setting(**{parameter: value})
-            elif not first:
-                return Outcome.ABORT  # nothing to smooth: one stage is all there is
-            try:
-                optimizer = self._stage_optimizer if first else warm(self._stage_optimizer, solver.warm_damping)
-                result = self._optimise("smooth", trial, xi, optimizer)
-            except NonFiniteResidual as error:
-                message = str(error)
-                return Outcome.ABORT if first else Outcome.FAILED
-            solution = self._record("smooth", Curve(trial, result.xi), result)
-            # measurements need not fit: what counts are the equations
-            norm = float(result.norm if self.measurements is None else trial.residual(result.xi).norm())
-            failed = not norm < solver.start_limit
-            if first and failed and self._coarse(result):
-                kept.append(solution)  # what a refinement on segments starts from, if not a solution
-                return Outcome.ABORT
-            if first and failed:
-                message = (
-                    f"start {self.start + 1} of seed {self.seed} failed: ‖r‖ = {norm:.2g} "
-                    f"after the {('first', 'second')[tries]} stage ({result.status.value})"
-                )
-                tries += 1
-                # smoothed less, the problem may have a solution, or one that is nearer to this guess
-                again = tries == 1 and self._smoothable and parameter == "smoothing" and not self.clock.spent
-                return Outcome.FAILED if again else Outcome.ABORT
-            if failed:
-                return Outcome.FAILED
-            first = False
-            trusted = self._trusted(solution)
-            if hold and not trusted:
-                return Outcome.UNTRUSTED
-            change = float((result.xi - xi).abs().max())
-            current, xi = trial, result.xi
-            if trusted or not kept:
-                kept.append(solution)
-            if not trusted and len(kept) == 1:
-                message = "no stage solves its own problem between the nodes; the first one is kept"
-            if change < 1e-6 * float(xi.abs().max()):
-                return Outcome.UNCHANGED
-            if trusted and self._reads_arcs and (blunter := self._blunter(kept)):
-                return Outcome.LEGIBLE if legible(solution.curve, blunter) else Outcome.SOLVED
-            return Outcome.SOLVED if trusted else Outcome.UNTRUSTED
-
-        solver.continuation.run(attempt)
-        return kept, message
-
-    def _coarse(self, result: OptimizeResult) -> bool:
+    def coarse(self, result: OptimizeResult) -> bool:
         """Whether a stage of large residual is best as it is: nothing is bounded, and the iteration has settled.
 
         Another start would settle at the same curve; more segments do not.
         """
         return self.solver.exact and self.bvp.law.n_switching == 0 and result.status.stationary
 
-    def _trusted(self, solution: Solution) -> bool:
+    def trusted(self, solution: Solution) -> bool:
         """Whether the stage's equations hold between the nodes too (a weak form claims its moments only).
 
         A refinement that reads no arcs off the curve may start from any stage: a coarse one needs more segments.
@@ -397,7 +344,7 @@ class _Run:
             return True
         return solution.off_node_residual <= self.solver.trust * solution.curve.largest_rate
 
-    def _blunter(self, stages: Sequence[Solution]) -> Curve | None:
+    def blunter(self, stages: Sequence[Solution]) -> Curve | None:
         """The stage before the last, if it was smoothed more."""
         curves = [stage.curve for stage in stages[-2:]]
         return curves[0] if curves[0].smoothing > curves[-1].smoothing else None
@@ -411,12 +358,12 @@ class _Run:
             return smoothed, ""
         name = type(refinement).__name__.lower()
         self.observer.stage_started(name, None, len(self.stages))
-        refined = refinement.run(smoothed.curve, self._callback, self._blunter(stages))
+        refined = refinement.run(smoothed.curve, self._callback, self.blunter(stages))
         improved = refined.curve is not smoothed.curve
         for result in refined.rounds:
             if not improved or result is not refined.result:
                 self._stage(name, None, result, float("nan"), float("nan"), None)
-        solution = self._record(name, refined.curve, refined.result) if improved else smoothed
+        solution = self.record(name, refined.curve, refined.result) if improved else smoothed
         if refined.outcome is refinements.Outcome.INTERRUPTED and not self.clock.spent:
             raise _Interrupted
         if refined.outcome is refinements.Outcome.SOLVED or (improved and not refinement.exact):
@@ -437,7 +384,7 @@ class _Run:
 
         return on_iteration
 
-    def _optimise(self, name: str, collocation: Collocation, xi: Tensor, optimizer: Optimizer) -> OptimizeResult:
+    def optimise(self, name: str, collocation: Collocation, xi: Tensor, optimizer: Optimizer) -> OptimizeResult:
         self.observer.stage_started(name, collocation.smoothing or None, len(self.stages))
         measured = self.measurements
         residual: Residual = collocation if measured is None else Measured(collocation, measured)
@@ -447,11 +394,11 @@ class _Run:
         else:
             result = self.journal.run(optimizer, residual, xi, told, self.clock.add)
         if result.status is Status.INTERRUPTED:
-            self._record(name, Curve(collocation, result.xi), result)
+            self.record(name, Curve(collocation, result.xi), result)
             raise _Interrupted
         return result
 
-    def _record(self, name: str, curve: Curve, result: OptimizeResult) -> Solution:
+    def record(self, name: str, curve: Curve, result: OptimizeResult) -> Solution:
         solution = Solution(curve)
         self._stage(
             name,
@@ -489,6 +436,78 @@ class _Run:
         )
         self.stages.append(stage)
         self.observer.stage_ended(stage)
+
+
+@dataclass
+class _Walk:
+    """One start on its way down the schedule: where it stands, and the stages so far that can be trusted.
+
+    n_failed: first stages that failed; until one has not, the walk has not begun.
+    """
+
+    run: _Run
+    collocation: Collocation
+    xi: Tensor
+    kept: list[Solution] = field(default_factory=list)
+    message: str = ""
+    begun: bool = False
+    n_failed: int = 0
+
+    def __call__(self, value: float, parameter: str, form: Form | None, *, hold: bool = False) -> Outcome:
+        """Solve one stage from where the walk stands; ``hold``: stay there if it cannot be trusted."""
+        run, smoothed = self.run, self.run.smoothable or parameter != "smoothing"
+        if self.begun and (run.clock.spent or not smoothed):  # nothing to smooth: one stage is all there is
+            return Outcome.ABORT
+        trial = replace(self.collocation, discretisation=run.discretisation(form))
+        if smoothed:
+            trial = trial.with_setting(**{parameter: value})
+        optimizer = run.stage_optimizer
+        if self.begun:
+            optimizer = warm(optimizer, run.solver.warm_damping)
+        try:
+            result = run.optimise("smooth", trial, self.xi, optimizer)
+        except NonFiniteResidual as error:
+            self.message = str(error)
+            return Outcome.FAILED if self.begun else Outcome.ABORT
+        solution = run.record("smooth", Curve(trial, result.xi), result)
+        # measurements need not fit: what counts are the equations
+        norm = float(result.norm if run.measurements is None else trial.residual(result.xi).norm())
+        if norm < run.solver.start_limit:
+            return self._advanced(trial, result.xi, solution, hold)
+        return Outcome.FAILED if self.begun else self._not_begun(solution, result, norm, parameter)
+
+    def _advanced(self, trial: Collocation, xi: Tensor, solution: Solution, hold: bool) -> Outcome:
+        """A stage that is solved: the walk goes there, and keeps it if it can be trusted."""
+        run, self.begun = self.run, True
+        trusted = run.trusted(solution)
+        if hold and not trusted:
+            return Outcome.UNTRUSTED
+        change = float((xi - self.xi).abs().max())
+        self.collocation, self.xi = trial, xi
+        if trusted or not self.kept:
+            self.kept.append(solution)
+        if not trusted and len(self.kept) == 1:
+            self.message = "no stage solves its own problem between the nodes; the first one is kept"
+        if change < 1e-6 * float(xi.abs().max()):
+            return Outcome.UNCHANGED
+        if trusted and run.reads_arcs and (blunter := run.blunter(self.kept)):
+            return Outcome.LEGIBLE if legible(solution.curve, blunter) else Outcome.SOLVED
+        return Outcome.SOLVED if trusted else Outcome.UNTRUSTED
+
+    def _not_begun(self, solution: Solution, result: OptimizeResult, norm: float, parameter: str) -> Outcome:
+        """A first stage that failed; at the next smoothing it is tried once more."""
+        run = self.run
+        if run.coarse(result):
+            self.kept.append(solution)  # what a refinement on segments starts from, if not a solution
+            return Outcome.ABORT
+        self.message = (
+            f"start {run.start + 1} of seed {run.seed} failed: ‖r‖ = {norm:.2g} "
+            f"after the {('first', 'second')[self.n_failed]} stage ({result.status.value})"
+        )
+        self.n_failed += 1
+        # smoothed less, the problem may have a solution, or one that is nearer to this guess
+        again = self.n_failed == 1 and run.smoothable and parameter == "smoothing" and not run.clock.spent
+        return Outcome.FAILED if again else Outcome.ABORT
 
 
 def _better(one: Certificate, other: Certificate) -> bool:
