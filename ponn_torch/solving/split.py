@@ -9,8 +9,9 @@ these are tried: a solved residual with the wrong arcs is an extremal of nothing
 from __future__ import annotations
 
 import math
+from collections import defaultdict
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import ClassVar
 
 import torch
@@ -41,6 +42,19 @@ MORE_SEGMENTS = 4  # multiples of n_segments that are tried where there is no sm
 
 
 @dataclass(frozen=True)
+class _Search:
+    """What the rounds of one refinement share, and what they have left so far.
+
+    tried: solved arcs that S was not content with, by the number of segments; what follows from them is not done twice.
+    """
+
+    discretisation: Discretisation
+    callback: MakeCallback | None
+    rounds: list[OptimizeResult] = field(default_factory=list)
+    tried: dict[int, list[Structure]] = field(default_factory=lambda: defaultdict(list))
+
+
+@dataclass(frozen=True)
 class Split(Segmentation):
     """Solve between switches until arcs and S agree and the equations hold between the nodes.
 
@@ -66,11 +80,12 @@ class Split(Segmentation):
     sharpening: float = 0.5
 
     def run(self, start: Curve, callback: MakeCallback | None = None, blunter: Curve | None = None) -> Refined:
-        disc, rounds = self.discretisation(start.collocation.bvp), list[OptimizeResult]()
+        search = _Search(self.discretisation(start.collocation.bvp), callback)
+        rounds = search.rounds
         read: list[tuple[Structure, int]] = []
         rungs: list[tuple[float, Curve]] = []
         refined = Refined(start, Outcome.STRUCTURE, rounds)
-        for smoothed, n_segments in self._starts(disc, start, rounds, callback):
+        for smoothed, n_segments in self._starts(search, start):
             if rounds and rounds[-1].status.cut:
                 return Refined(smoothed, Outcome.INTERRUPTED, rounds)
             structures = [find_structure(smoothed, polish=0)]
@@ -86,7 +101,7 @@ class Split(Segmentation):
                 if any(structure.near(other, moved) and n_segments == n for other, n in read):
                     continue
                 read.append((structure, n_segments))
-                refined = self._split(disc, smoothed, structure, n_segments, rounds, callback)
+                refined = self._split(search, smoothed, structure, n_segments)
                 if refined.outcome in (Outcome.SOLVED, Outcome.INTERRUPTED):
                     return refined
         singular = singular_interval([(value, undecided(curve, value)) for value, curve in rungs])
@@ -96,9 +111,7 @@ class Split(Segmentation):
         ends = [f"{time * start.collocation.bvp.time_unit / unit.size:.4g}" for time in singular]
         return Refined(smoothed, Outcome.SINGULAR, rounds, f": from {ends[0]} to {ends[1]} {unit.label}")
 
-    def _starts(
-        self, disc: Discretisation, start: Curve, rounds: list[OptimizeResult], callback: MakeCallback | None
-    ) -> Iterator[tuple[Curve, int]]:
+    def _starts(self, search: _Search, start: Curve) -> Iterator[tuple[Curve, int]]:
         """Curves to read the arcs from, and numbers of segments: ever sharper ones, or where none is smoothed, more.
 
         A split begins with as many segments as the curve that it starts from, if that leaves some to be halved.
@@ -113,28 +126,20 @@ class Split(Segmentation):
                 continue
             sharper = factor * smoothing
             times = graded_times(start, sharper, least)
-            collocation = Collocation.on_segments(disc, times, setting=start.collocation.setting)
-            curve, result = self.solve(collocation.with_setting(smoothing=sharper), start, callback)
-            rounds.append(result)
+            collocation = Collocation.on_segments(search.discretisation, times, setting=start.collocation.setting)
+            curve, result = self.solve(collocation.with_setting(smoothing=sharper), start, search.callback)
+            search.rounds.append(result)
             if result.status.cut or float(result.norm) < LEGIBLE:
                 start, smoothing = curve, sharper
                 yield start, least
             else:
                 factor = factor**0.5
 
-    def _split(
-        self,
-        disc: Discretisation,
-        curve: Curve,
-        structure: Structure,
-        n_segments: int,
-        rounds: list[OptimizeResult],
-        callback: MakeCallback | None,
-    ) -> Refined:
+    def _split(self, search: _Search, curve: Curve, structure: Structure, n_segments: int) -> Refined:
         """Rounds from one curve, depth first through the repairs of its arcs; the last curve that is solved is kept."""
+        disc, rounds, tried = search.discretisation, search.rounds, search.tried[n_segments]
         bvp, parameters = disc.bvp, curve.collocation.setting.parameters
         pending = [(curve, _spread(structure, curve.times, n_segments), math.inf)]
-        seen: list[Structure] = []
         outcome = Outcome.STRUCTURE
         for _ in range(self.max_rounds):
             if not pending:
@@ -148,12 +153,13 @@ class Split(Segmentation):
             collocation = Collocation.on_segments(
                 disc, segments.times, events=segments.events, setting=Setting(regime, parameters)
             )
-            solution, result = self.solve(collocation, before, callback)
+            solution, result = self.solve(collocation, before, search.callback)
             rounds.append(result)
             if result.status.cut:
                 return Refined(solution, Outcome.INTERRUPTED, rounds)
             solved, found = self.solved(result), claimed_structure(solution)
-            if solved and any(found.near(other, SAME_SWITCH) for other in seen):
+            if solved and any(found.near(other, SAME_SWITCH) for other in tried):
+                curve, outcome = solution, Outcome.STRUCTURE
                 continue
             repairs, coarse = self._repairs(solution, solved), self.coarse(solution, solved or regime.arcs is not None)
             if not solved:
@@ -171,8 +177,9 @@ class Split(Segmentation):
                 halved = Segments(solution.times, segments.events, segments.arcs).halved(coarse)
                 pending.append((solution, halved, float(result.norm)))
                 continue
-            seen.append(found)
-            repairs = [other for other in repairs if not any(other.near(one, SAME_SWITCH) for one in seen)]
+            if solved:
+                tried.append(found)
+            repairs = [other for other in repairs if not any(other.near(one, SAME_SWITCH) for one in tried)]
             pending += [(curve, _spread(other, curve.times, n_segments), math.inf) for other in reversed(repairs)]
         return Refined(curve, outcome, rounds)
 

@@ -23,7 +23,7 @@ from ponn_torch.solving.guess import RandomGuess, project
 from ponn_torch.solving.refinement import Outcome, Refined, Subdivide, shared_out
 from ponn_torch.solving.sharpening import legible
 from ponn_torch.solving.solution import Solution
-from ponn_torch.solving.split import MOVED, Split
+from ponn_torch.solving.split import MOVED, Split, _Search
 from ponn_torch.solving.switching import find_structure
 
 OPTIMA = {"earth_mars": 396.05984393, "mars_landing": 268.0146563274}
@@ -92,6 +92,17 @@ def test_rounds_that_run_out_are_said():
     assert len(refined.rounds) == 1
 
 
+def test_what_s_was_not_content_with_is_not_taken_up_again_from_a_sharper_curve():
+    """Repairs follow from the solved curve alone, wherever it was reached from."""
+    start = smoothed("earth_mars", 1.0)
+    structure = find_structure(start)  # three arcs of five
+    search = _Search(Split().discretisation(start.collocation.bvp), None)
+    assert Split(max_rounds=1)._split(search, start, structure, 8).outcome is Outcome.STRUCTURE
+    assert Split()._split(search, start, structure, 8).outcome is Outcome.STRUCTURE
+    assert len(search.rounds) == 2
+    assert Split()._split(search, start, structure, 9).outcome is Outcome.SOLVED  # other segments are another chance
+
+
 class Unlucky(Split):
     """A split that notes what it is asked to try, and solves none of it."""
 
@@ -99,9 +110,9 @@ class Unlucky(Split):
         super().__init__(**settings)
         object.__setattr__(self, "tried", [])
 
-    def _split(self, disc, curve, structure, n_segments, rounds, callback):
+    def _split(self, search, curve, structure, n_segments):
         self.tried.append((structure, n_segments))
-        return Refined(curve, Outcome.RESIDUAL, rounds)
+        return Refined(curve, Outcome.RESIDUAL, search.rounds)
 
 
 def test_arcs_that_were_not_solved_are_tried_again_once_a_sharper_curve_has_moved_their_switches():
