@@ -1,4 +1,4 @@
-"""The README says what works: its Python is run, its commands are composed, its files exist."""
+"""The README and docs/ say what works: their Python is run, their commands are composed, their files exist."""
 
 import re
 import shlex
@@ -13,12 +13,19 @@ from ponn_torch.cli.overrides import PONN as PONN_APPLICATION
 from ponn_torch.cli.overrides import RHC, Application, groups, read
 
 ROOT = Path(__file__).parents[1]
-README = (ROOT / "README.md").read_text(encoding="utf-8")
-PYTHON = re.findall(r"^```python\n(.*?)^```", README, re.MULTILINE | re.DOTALL)
-SHELL = re.findall(r"^```sh\n(.*?)^```", README, re.MULTILINE | re.DOTALL)
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+TEXT = "\n".join(page.read_text(encoding="utf-8") for page in PAGES)
+PYTHON = re.findall(r"^```python\n(.*?)^```", TEXT, re.MULTILINE | re.DOTALL)
+SHELL = re.findall(r"^```sh\n(.*?)^```", TEXT, re.MULTILINE | re.DOTALL)
 COMMANDS = [words for block in SHELL for line in block.splitlines() if (words := shlex.split(line, comments=True))]
-PONN = [words[1:] for words in COMMANDS if words[0] == "ponn"]
-GUIDE = [words[1:] for words in COMMANDS if words[0] == "ponn-rhc"]
+UNIQUE = sorted({tuple(words) for words in COMMANDS})
+PONN = [list(words[1:]) for words in UNIQUE if words[0] == "ponn"]
+GUIDE = [list(words[1:]) for words in UNIQUE if words[0] == "ponn-rhc"]
+LINKED = [
+    (page, link or image)
+    for page in [*PAGES, *sorted((ROOT / "experiments").glob("**/README.md"))]
+    for link, image in re.findall(r"\]\(([^)#:]+)(?:#[^)]*)?\)|src=\"([^\"]+)\"", page.read_text(encoding="utf-8"))
+]
 
 
 def test_python_runs_from_top_to_bottom(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -62,21 +69,27 @@ def test_guidance_commands_are_understood(arguments: list[str]) -> None:
 
 @pytest.mark.parametrize(("application", "header"), [(PONN_APPLICATION, "| group |"), (RHC, "| `ponn-rhc` |")])
 def test_table_of_groups_is_complete(application: Application, header: str) -> None:
-    table = README.partition(header)[2].partition("\n\n")[0]
+    table = TEXT.partition(header)[2].partition("\n\n")[0]
     rows = dict(re.findall(r"^\| `(\w+)` \| (.*)\|$", table, re.MULTILINE))
     for name, options in groups(application).items():
         if name == "hydra":
             continue
         for option in set(options) - {"custom"}:  # which a reference stands for
-            assert f"`{option}`" in rows[name], f"{name}={option} is missing from the README's table"
+            assert f"`{option}`" in rows[name], f"{name}={option} is missing from the table of docs/"
 
 
-@pytest.mark.parametrize("link", sorted(set(re.findall(r"\]\(([^)#:]+)\)|src=\"([^\"]+)\"", README))))
-def test_linked_files_exist(link: tuple[str, str]) -> None:
-    assert (ROOT / (link[0] or link[1])).is_file()
+@pytest.mark.parametrize(("page", "link"), sorted(set(LINKED)), ids=lambda x: str(getattr(x, "name", x)))
+def test_linked_files_exist(page: Path, link: str) -> None:
+    assert (page.parent / link).is_file()
+
+
+def test_every_study_is_listed() -> None:
+    index = (ROOT / "experiments" / "README.md").read_text(encoding="utf-8")
+    for study in (ROOT / "experiments").glob("*/README.md"):
+        assert f"]({study.parent.name}/README.md)" in index
 
 
 def test_make_targets_exist() -> None:
     makefile = (ROOT / "Makefile").read_text(encoding="utf-8")
-    for target in re.findall(r"(?:^|`)make ([a-z]+)\b", README, re.MULTILINE):
+    for target in re.findall(r"(?:^|`)make ([a-z]+)\b", TEXT, re.MULTILINE):
         assert re.search(rf"^{target}:", makefile, re.MULTILINE), f"no make {target}"
