@@ -10,8 +10,8 @@ from ponn_torch.optimal_control.problem import OptimalControlProblem
 from ponn_torch.problems.earth_mars import earth_mars
 from ponn_torch.problems.mars_landing import mars_landing
 from ponn_torch.solving.certificate import Certificate
+from ponn_torch.solving.result import SolveResult
 from ponn_torch.solving.solution import Solution
-from ponn_torch.solving.solver import SolveResult
 
 PROBLEMS: dict[str, Callable[[], OptimalControlProblem]] = {
     "earth_mars": earth_mars,

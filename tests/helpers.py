@@ -22,9 +22,10 @@ from ponn_torch.optim.chain import Chain
 from ponn_torch.optim.gradient import Adam
 from ponn_torch.optim.least_squares import GaussNewton, LevenbergMarquardt, ScipyLeastSquares
 from ponn_torch.optim.quasi_newton import LBFGS, SSBroyden
+from ponn_torch.optimal_control.boundary_value_problem import BoundaryValueProblem
 from ponn_torch.optimal_control.collocation import Collocation
 from ponn_torch.optimal_control.discretisation import Discretisation, Form, Strong
-from ponn_torch.optimal_control.pontryagin import BoundaryValueProblem, pontryagin
+from ponn_torch.optimal_control.pontryagin import pontryagin
 from ponn_torch.optimal_control.problem import OptimalControlProblem
 
 # -- optimisers ----------------------------------------------------------------------------------------------

@@ -15,7 +15,7 @@ from ponn_torch.build import Plan, build
 from ponn_torch.cli.run import run
 from ponn_torch.optimal_control.problem import FreeTime
 from ponn_torch.settings import ROOMS, target
-from ponn_torch.solving import solver as solver_module
+from ponn_torch.solving import run as run_module
 from ponn_torch.solving.certificate import Certificate
 from ponn_torch.solving.solver import Solver
 
@@ -195,7 +195,7 @@ def certificate(tmp_path_factory: pytest.TempPathFactory) -> Certificate:
 def test_config_solves_with_a_tiny_budget(
     group: str, option: str, certificate: Certificate, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(solver_module, "certify", lambda *_: certificate)
+    monkeypatch.setattr(run_module, "certify", lambda *_: certificate)
     outcome = run(composed(tiny(group, option)), tmp_path, tiny(group, option))
     assert outcome.exit_code in (0, 2), outcome.message
     assert outcome.cost is not None

@@ -18,9 +18,9 @@ from ponn_torch.optim.base import Optimizer, OptimizeResult, Stopping, Stopwatch
 from ponn_torch.optim.chain import Chain, OutputLayer
 from ponn_torch.optim.least_squares import GaussNewton, LevenbergMarquardt
 from ponn_torch.optim.variable_projection import VariableProjection
+from ponn_torch.optimal_control.boundary_value_problem import BoundaryValueProblem
 from ponn_torch.optimal_control.collocation import Collocation
 from ponn_torch.optimal_control.discretisation import Discretisation
-from ponn_torch.optimal_control.pontryagin import BoundaryValueProblem
 
 STEEPEST = 1e3  # of a candidate, in z; on FINE nodes it is resolved
 FINE = make_panels("legendre_gauss", torch.linspace(-1.0, 1.0, 321, dtype=torch.float64), 4)

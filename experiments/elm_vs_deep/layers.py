@@ -12,7 +12,8 @@ from experiments.elm_vs_deep.methods import CHEBYSHEV, ELM, FROZEN, MLP_LM, Meth
 from experiments.tables import Report, Row, markdown, worst
 from ponn_torch.ansatz.basis import Chebyshev, RandomFeatures
 from ponn_torch.ansatz.networks import MLP
-from ponn_torch.optimal_control.pontryagin import BoundaryValueProblem, pontryagin
+from ponn_torch.optimal_control.boundary_value_problem import BoundaryValueProblem
+from ponn_torch.optimal_control.pontryagin import pontryagin
 from ponn_torch.problems.boundary_layer import boundary_layer, exact_solution
 from ponn_torch.solving.guess import ScaledCurve
 

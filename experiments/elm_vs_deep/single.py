@@ -12,10 +12,10 @@ from experiments.elm_vs_deep.methods import Method
 from experiments.tables import Row, spread
 from ponn_torch.numerics.nodes import make_nodes
 from ponn_torch.optim.base import OptimizeResult
+from ponn_torch.optimal_control.boundary_value_problem import BoundaryValueProblem
 from ponn_torch.optimal_control.collocation import Collocation
 from ponn_torch.optimal_control.curve import Curve
 from ponn_torch.optimal_control.discretisation import Discretisation
-from ponn_torch.optimal_control.pontryagin import BoundaryValueProblem
 from ponn_torch.solving.guess import ScaledCurve, project
 
 N_TEST = 2001

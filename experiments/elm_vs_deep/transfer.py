@@ -29,10 +29,11 @@ from ponn_torch.numerics.nodes import make_nodes
 from ponn_torch.optim.base import Stopping
 from ponn_torch.optim.chain import OutputLayer
 from ponn_torch.optim.least_squares import LevenbergMarquardt
+from ponn_torch.optimal_control.boundary_value_problem import BoundaryValueProblem
 from ponn_torch.optimal_control.collocation import Collocation
 from ponn_torch.optimal_control.curve import Curve
 from ponn_torch.optimal_control.discretisation import Discretisation
-from ponn_torch.optimal_control.pontryagin import BoundaryValueProblem, pontryagin
+from ponn_torch.optimal_control.pontryagin import pontryagin
 from ponn_torch.problems.energy_transfer import energy_transfer
 from ponn_torch.solving.guess import ScaledCurve, project
 from ponn_torch.solving.paths import PolarTransfer

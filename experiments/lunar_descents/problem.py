@@ -8,8 +8,9 @@ from collections.abc import Sequence
 import torch
 from scipy.optimize import brentq
 
-from ponn_torch.optimal_control.control_laws import Entropy, Regulariser, ThrustBall
+from ponn_torch.optimal_control.control_laws import ThrustBall
 from ponn_torch.optimal_control.problem import FreeTime, Named, OptimalControlProblem
+from ponn_torch.optimal_control.regularisers import Entropy, Regulariser
 from ponn_torch.problems.constants import LANDING_DISPLAY, STANDARD_GRAVITY
 
 GRAVITY, EXHAUST, MASS = 1.62, 311.0 * STANDARD_GRAVITY, 4000.0  # m/s², m/s, kg

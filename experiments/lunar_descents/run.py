@@ -19,7 +19,7 @@ from torch import Tensor
 from experiments.lunar_descents.problem import descent, vertical_fuel
 from experiments.solves import row
 from experiments.tables import Report, markdown, run_study, share, spread, worst
-from ponn_torch.optimal_control.control_laws import Entropy, Quadratic, Regulariser
+from ponn_torch.optimal_control.regularisers import Entropy, Quadratic, Regulariser
 from ponn_torch.solving.solver import Solver
 
 FOLDER = Path(__file__).parent

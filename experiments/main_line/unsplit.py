@@ -15,8 +15,8 @@ from ponn_torch.optim.base import Stopping
 from ponn_torch.optim.least_squares import LevenbergMarquardt
 from ponn_torch.optimal_control.discretisation import Weak
 from ponn_torch.solving.continuation import Ladder, Phases, log_ladder
-from ponn_torch.solving.observer import StageResult
-from ponn_torch.solving.solver import Solver, SolveResult
+from ponn_torch.solving.result import SolveResult, StageResult
+from ponn_torch.solving.solver import Solver
 
 SIZES = {"earth_mars": (70, 140), "mars_landing": (30, 120)}  # L, n of the paper
 PAPER_ERRORS_KG = {"earth_mars": 0.79, "mars_landing": 0.37}  # its PoNN against its own optimal reference

@@ -20,7 +20,8 @@ from ponn_torch.problems.constants import DAY
 from ponn_torch.problems.earth_mars import earth_mars, earth_mars_minimum_time
 from ponn_torch.problems.mars_landing import mars_landing
 from ponn_torch.solving.paths import PolarTransfer
-from ponn_torch.solving.solver import Solver, SolveResult
+from ponn_torch.solving.result import SolveResult
+from ponn_torch.solving.solver import Solver
 
 FOLDER = Path(__file__).parent
 SOLVER = Solver(n_starts=4)

@@ -19,8 +19,9 @@ from torch import Tensor
 from ponn_torch.baselines.answer import DirectSolution
 from ponn_torch.baselines.transcription import Answer, Array, PathConstraints, Phase, Point, Program
 from ponn_torch.optim.base import Stopwatch
+from ponn_torch.optimal_control.boundary_value_problem import Setting
 from ponn_torch.optimal_control.control_laws import LOWER, UPPER, Regime
-from ponn_torch.optimal_control.pontryagin import Setting, pontryagin
+from ponn_torch.optimal_control.pontryagin import pontryagin
 from ponn_torch.optimal_control.problem import OptimalControlProblem
 from ponn_torch.solving.guess import Guess
 

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from ponn_torch.baselines.direct import TwoStage, Unstructured
 from ponn_torch.baselines.symbolic import load_casadi
-from ponn_torch.optimal_control.pontryagin import BoundaryValueProblem
+from ponn_torch.optimal_control.boundary_value_problem import BoundaryValueProblem
 from ponn_torch.optimal_control.problem import OptimalControlProblem
 from ponn_torch.reporting.style import number, unit
 from ponn_torch.solving.feasibility import check_control, check_final_time

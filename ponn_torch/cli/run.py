@@ -26,7 +26,7 @@ from ponn_torch.reporting.style import number, unit
 from ponn_torch.settings import ConfigError, one_line, users_line
 from ponn_torch.solving.certificate import Certificate
 from ponn_torch.solving.journal import Journal
-from ponn_torch.solving.observer import StageResult
+from ponn_torch.solving.result import StageResult
 from ponn_torch.solving.solution import Solution
 
 CHOICES = "choices.yaml"

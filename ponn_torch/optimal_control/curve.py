@@ -8,9 +8,9 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
+from ponn_torch.optimal_control.boundary_value_problem import Setting
 from ponn_torch.optimal_control.collocation import Collocation, Unknowns
 from ponn_torch.optimal_control.control_laws import Regime
-from ponn_torch.optimal_control.pontryagin import Setting
 
 
 @dataclass(frozen=True, eq=False)

@@ -21,10 +21,10 @@ from ponn_torch.ansatz.constraints import SwitchingFunctions, hermite
 from ponn_torch.ansatz.networks import MLP
 from ponn_torch.numerics.nodes import NodeSet, legendre_moments
 from ponn_torch.numerics.tape import Replay
+from ponn_torch.optimal_control.boundary_value_problem import BoundaryValueProblem, Chain
 from ponn_torch.optimal_control.deep_expressions import DeepExpressions
 from ponn_torch.optimal_control.expressions import Expressions, LinearExpressions
 from ponn_torch.optimal_control.meaning import Keyed
-from ponn_torch.optimal_control.pontryagin import BoundaryValueProblem, Chain
 
 # -- test functions: how the pointwise residual becomes rows ---------------------------------------------------------
 

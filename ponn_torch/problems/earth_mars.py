@@ -8,8 +8,9 @@ from typing import Any
 
 import torch
 
-from ponn_torch.optimal_control.control_laws import ThrustBall, make_regulariser
+from ponn_torch.optimal_control.control_laws import ThrustBall
 from ponn_torch.optimal_control.problem import DisplayUnit, FreeTime, Named, OptimalControlProblem
+from ponn_torch.optimal_control.regularisers import make_regulariser
 from ponn_torch.problems.arguments import check_positive, check_thrust, check_vectors
 from ponn_torch.problems.constants import ASTRONOMICAL_UNIT, DAY, KILOMETRE, STANDARD_GRAVITY, SUN_GM
 from ponn_torch.problems.known import known_optimum

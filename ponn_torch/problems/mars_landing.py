@@ -7,8 +7,9 @@ from collections.abc import Sequence
 
 import torch
 
-from ponn_torch.optimal_control.control_laws import ThrustBall, make_regulariser
+from ponn_torch.optimal_control.control_laws import ThrustBall
 from ponn_torch.optimal_control.problem import FreeTime, Named, OptimalControlProblem
+from ponn_torch.optimal_control.regularisers import make_regulariser
 from ponn_torch.problems.arguments import check_positive, check_thrust, check_vectors
 from ponn_torch.problems.constants import LANDING_DISPLAY, STANDARD_GRAVITY
 from ponn_torch.problems.known import known_optimum

@@ -6,8 +6,9 @@ from collections.abc import Sequence
 
 import torch
 
-from ponn_torch.optimal_control.control_laws import Box, make_regulariser
+from ponn_torch.optimal_control.control_laws import Box
 from ponn_torch.optimal_control.problem import FreeTime, Named, OptimalControlProblem
+from ponn_torch.optimal_control.regularisers import make_regulariser
 from ponn_torch.problems.arguments import check_positive, check_vectors
 from ponn_torch.problems.known import known_optimum
 

@@ -24,7 +24,7 @@ from ponn_torch.reporting.style import (
     symbol,
     time_axes,
 )
-from ponn_torch.solving.observer import StageResult
+from ponn_torch.solving.result import StageResult
 from ponn_torch.solving.solution import Solution
 
 SMOOTH = "smooth"  # name of the stages before a refinement

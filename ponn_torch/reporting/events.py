@@ -18,7 +18,8 @@ from ponn_torch.optim.base import Record
 from ponn_torch.reporting.figures import stage_figure
 from ponn_torch.reporting.recorder import Recorder
 from ponn_torch.solving.certificate import Certificate
-from ponn_torch.solving.observer import Look, StageResult
+from ponn_torch.solving.observer import Look
+from ponn_torch.solving.result import StageResult
 from ponn_torch.solving.solution import Solution
 
 # Written at every iteration by every optimiser, so that runs share their charts.

@@ -36,7 +36,7 @@ from ponn_torch.reporting.style import (
     unit,
 )
 from ponn_torch.reporting.trajectories import plane_figure, trajectory_figure
-from ponn_torch.solving.observer import StageResult
+from ponn_torch.solving.result import StageResult
 from ponn_torch.solving.solution import Samples, Solution
 
 

@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING
 from ponn_torch.optim.base import Record
 from ponn_torch.reporting.recorder import Recorder
 from ponn_torch.solving.certificate import Certificate
-from ponn_torch.solving.observer import Look, StageResult
+from ponn_torch.solving.observer import Look
+from ponn_torch.solving.result import StageResult
 from ponn_torch.solving.solution import Solution
 
 if TYPE_CHECKING:

@@ -6,7 +6,8 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
-from ponn_torch.solving.observer import Observer, StageResult
+from ponn_torch.solving.observer import Observer
+from ponn_torch.solving.result import StageResult
 
 
 class Recorder(Observer):

@@ -20,7 +20,8 @@ from ponn_torch.reporting.progress import Progress
 from ponn_torch.reporting.recorder import Recorder, finite_or_none, stage_entry
 from ponn_torch.reporting.reference import Reference
 from ponn_torch.solving.certificate import Certificate
-from ponn_torch.solving.observer import Look, StageResult
+from ponn_torch.solving.observer import Look
+from ponn_torch.solving.result import StageResult
 from ponn_torch.solving.solution import Solution
 
 if TYPE_CHECKING:

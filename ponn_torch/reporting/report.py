@@ -20,7 +20,7 @@ from ponn_torch.reporting.figures import all_figures
 from ponn_torch.reporting.recorder import finite_or_none
 from ponn_torch.reporting.style import arc_intervals, number, save, unit
 from ponn_torch.solving.certificate import Certificate
-from ponn_torch.solving.observer import StageResult
+from ponn_torch.solving.result import StageResult
 from ponn_torch.solving.solution import Solution
 
 REPORT, ENVIRONMENT, CERTIFICATE = "report.md", "environment.json", "certificate.json"

@@ -10,8 +10,8 @@ import torch
 from torch import Tensor
 
 from ponn_torch.numerics.autodiff import gradients
+from ponn_torch.optimal_control.boundary_value_problem import Setting
 from ponn_torch.optimal_control.control_laws import INTERIOR, Regime
-from ponn_torch.optimal_control.pontryagin import Setting
 from ponn_torch.solving.flight import Flight, arc_knots
 from ponn_torch.solving.solution import Solution
 from ponn_torch.solving.switching import wrong_side

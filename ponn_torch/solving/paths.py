@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from ponn_torch.numerics.nodes import differentiation_matrix, interpolation_matrix, make_nodes
-from ponn_torch.optimal_control.pontryagin import BoundaryValueProblem
+from ponn_torch.optimal_control.boundary_value_problem import BoundaryValueProblem
 from ponn_torch.optimal_control.problem import Named, nearest
 from ponn_torch.solving.guess import ScaledCurve
 

@@ -20,10 +20,10 @@ from ponn_torch.numerics.nodes import make_nodes
 from ponn_torch.optim.base import Callback, Optimizer, OptimizeResult, Stopping
 from ponn_torch.optim.chain import Chain, OutputLayer
 from ponn_torch.optim.least_squares import LevenbergMarquardt
+from ponn_torch.optimal_control.boundary_value_problem import BoundaryValueProblem
 from ponn_torch.optimal_control.collocation import Collocation
 from ponn_torch.optimal_control.curve import Curve
 from ponn_torch.optimal_control.discretisation import Discretisation, Strong, discretise
-from ponn_torch.optimal_control.pontryagin import BoundaryValueProblem
 from ponn_torch.solving.guess import project
 
 WORST = 0.01  # of the largest residual between the nodes: segments that are halved first

@@ -15,10 +15,11 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ponn_torch.numerics.quadrature import integrate
+from ponn_torch.optimal_control.boundary_value_problem import BoundaryValueProblem, Setting
 from ponn_torch.optimal_control.control_laws import INTERIOR, LOWER, UPPER
 from ponn_torch.optimal_control.curve import Curve
 from ponn_torch.optimal_control.discretisation import Weak
-from ponn_torch.optimal_control.pontryagin import BoundaryValueProblem, Setting, pontryagin
+from ponn_torch.optimal_control.pontryagin import pontryagin
 from ponn_torch.optimal_control.problem import DisplayUnit, OptimalControlProblem
 from ponn_torch.solving.storage import load_curve, save_curve
 

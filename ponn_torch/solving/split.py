@@ -18,21 +18,15 @@ import torch
 from torch import Tensor
 
 from ponn_torch.optim.base import OptimizeResult
+from ponn_torch.optimal_control.boundary_value_problem import Setting
 from ponn_torch.optimal_control.collocation import Collocation
 from ponn_torch.optimal_control.control_laws import Regime
 from ponn_torch.optimal_control.curve import Curve
 from ponn_torch.optimal_control.discretisation import Discretisation
-from ponn_torch.optimal_control.pontryagin import Setting
 from ponn_torch.optimal_control.problem import DisplayUnit
 from ponn_torch.solving.refinement import MakeCallback, Outcome, Refined, Segmentation, Segments, shared_out
 from ponn_torch.solving.sharpening import graded_times, singular_interval, undecided
-from ponn_torch.solving.switching import (
-    Structure,
-    claimed_structure,
-    find_structure,
-    needles,
-    without_short_arcs,
-)
+from ponn_torch.solving.switching import Structure, claimed_structure, find_structure, needles, without_short_arcs
 
 COLLAPSED = 1e-7  # fraction of the final time, below which an arc is solved away to nothing
 LEGIBLE = 1e-4  # ‖r‖ of a sharpened curve whose arcs are worth reading

@@ -15,12 +15,13 @@ from torch import Tensor
 from ponn_torch import __version__
 from ponn_torch.ansatz.basis import FreeFunction
 from ponn_torch.numerics.nodes import NodeSet
+from ponn_torch.optimal_control.boundary_value_problem import Chain, Setting
 from ponn_torch.optimal_control.collocation import Collocation
 from ponn_torch.optimal_control.control_laws import Regime
 from ponn_torch.optimal_control.curve import Curve
 from ponn_torch.optimal_control.discretisation import Discretisation, Form, Strong, Weak
 from ponn_torch.optimal_control.expressions import LinearExpressions
-from ponn_torch.optimal_control.pontryagin import Chain, Setting, pontryagin
+from ponn_torch.optimal_control.pontryagin import pontryagin
 from ponn_torch.optimal_control.problem import OptimalControlProblem, nearest
 from ponn_torch.optimal_control.references import load_problem, relative_reference, resolved_reference
 

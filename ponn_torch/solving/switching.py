@@ -9,9 +9,9 @@ from itertools import pairwise
 import torch
 from torch import Tensor
 
+from ponn_torch.optimal_control.boundary_value_problem import Setting
 from ponn_torch.optimal_control.control_laws import INTERIOR, LOWER, UPPER, Regime
 from ponn_torch.optimal_control.curve import Curve
-from ponn_torch.optimal_control.pontryagin import Setting
 
 
 @dataclass(frozen=True)

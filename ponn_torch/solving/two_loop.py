@@ -20,10 +20,10 @@ from torch import Tensor
 from ponn_torch.optim.base import Callback, OptimizeResult, Record, Status
 from ponn_torch.optim.least_squares import LevenbergMarquardt
 from ponn_torch.optim.restricted import Restricted
+from ponn_torch.optimal_control.boundary_value_problem import Setting
 from ponn_torch.optimal_control.collocation import Collocation
 from ponn_torch.optimal_control.control_laws import Regime
 from ponn_torch.optimal_control.curve import Curve
-from ponn_torch.optimal_control.pontryagin import Setting
 from ponn_torch.solving.guess import project
 from ponn_torch.solving.refinement import MakeCallback, Outcome, Refined, Segmentation
 from ponn_torch.solving.switching import find_structure

@@ -9,7 +9,8 @@ import torch
 from torch import Tensor
 from torch.func import grad, vmap
 
-from ponn_torch.numerics.tape import Replay, Tape, Unrecordable, taped
+from ponn_torch.numerics.tape import Replay, Tape, taped
+from ponn_torch.numerics.transcript import Unrecordable
 
 
 def pendulum(t: Tensor, x: Tensor) -> Tensor:

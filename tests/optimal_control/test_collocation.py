@@ -17,11 +17,12 @@ from ponn_torch.numerics.nodes import differentiation_matrix, make_nodes
 from ponn_torch.numerics.tape import RECORDING_PAYS
 from ponn_torch.optim.base import Stopping
 from ponn_torch.optim.least_squares import LevenbergMarquardt
+from ponn_torch.optimal_control.boundary_value_problem import BoundaryValueProblem, Setting
 from ponn_torch.optimal_control.collocation import Collocation, component_names
 from ponn_torch.optimal_control.control_laws import Regime
 from ponn_torch.optimal_control.curve import Curve
 from ponn_torch.optimal_control.discretisation import Discretisation, Strong, Weak
-from ponn_torch.optimal_control.pontryagin import BoundaryValueProblem, Setting, pontryagin
+from ponn_torch.optimal_control.pontryagin import pontryagin
 from ponn_torch.optimal_control.problem import OptimalControlProblem
 from ponn_torch.solving.guess import project
 

@@ -16,17 +16,15 @@ from torch import Tensor
 from ponn_torch.optimal_control.control_laws import (
     INTERIOR,
     LOWER,
-    REGULARISERS,
     UPPER,
     Box,
     ControlSet,
-    Entropy,
     Minimiser,
     Regime,
     ThrustBall,
     Unconstrained,
-    make_regulariser,
 )
+from ponn_torch.optimal_control.regularisers import REGULARISERS, Entropy, make_regulariser
 
 NONE = SimpleNamespace()
 ONE = torch.ones(4, 1, dtype=torch.float64)

@@ -16,11 +16,12 @@ import torch
 from helpers import PROBLEMS
 
 from ponn_torch.numerics.tape import RECORDING_PAYS
+from ponn_torch.optimal_control.boundary_value_problem import Setting
 from ponn_torch.optimal_control.collocation import Collocation
 from ponn_torch.optimal_control.control_laws import Regime, ThrustBall
 from ponn_torch.optimal_control.discretisation import discretise
 from ponn_torch.optimal_control.meaning import LARGE, MOST, Keyed, meaning
-from ponn_torch.optimal_control.pontryagin import Setting, pontryagin, probe_points
+from ponn_torch.optimal_control.pontryagin import pontryagin, probe_points
 from ponn_torch.solving.solver import Solver
 
 

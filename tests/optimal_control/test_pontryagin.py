@@ -12,8 +12,9 @@ from helpers import PROBLEMS, VARIANTS, bvp_of, mass_variables, problem, random,
 from torch import Tensor
 from torch.func import grad, jvp
 
+from ponn_torch.optimal_control.boundary_value_problem import BoundaryValueProblem, Chain, Setting
 from ponn_torch.optimal_control.control_laws import Box, Regime
-from ponn_torch.optimal_control.pontryagin import BoundaryValueProblem, Chain, Setting, pontryagin
+from ponn_torch.optimal_control.pontryagin import pontryagin
 from ponn_torch.optimal_control.problem import OptimalControlProblem
 
 RHO = 0.3

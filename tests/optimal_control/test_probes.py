@@ -4,10 +4,11 @@ import pytest
 import torch
 
 from ponn_torch.optimal_control.collocation import Collocation
-from ponn_torch.optimal_control.control_laws import Box, Entropy, Quadratic, Unconstrained
+from ponn_torch.optimal_control.control_laws import Box, Unconstrained
 from ponn_torch.optimal_control.discretisation import Discretisation
 from ponn_torch.optimal_control.pontryagin import pontryagin
 from ponn_torch.optimal_control.problem import FreeTime, OptimalControlProblem
+from ponn_torch.optimal_control.regularisers import Entropy, Quadratic
 
 
 def cart(**changes):

@@ -17,8 +17,9 @@ import pytest
 from scipy.optimize import root
 
 from ponn_torch.cli import main
-from ponn_torch.optimal_control.control_laws import Box, Quadratic, ThrustBall
+from ponn_torch.optimal_control.control_laws import Box, ThrustBall
 from ponn_torch.optimal_control.problem import FreeTime, OptimalControlProblem
+from ponn_torch.optimal_control.regularisers import Quadratic
 from ponn_torch.solving.solver import Solver
 
 GRAVITY, EXHAUST, MASS = 1.62, 311.0 * 9.80665, 4000.0

@@ -15,9 +15,9 @@ from ponn_torch.optimal_control.problem import DisplayUnit, OptimalControlProble
 from ponn_torch.problems.mars_landing import mars_landing
 from ponn_torch.solving.continuation import Ladder, Single
 from ponn_torch.solving.guess import RandomGuess, project
-from ponn_torch.solving.observer import StageResult
+from ponn_torch.solving.result import SolveResult, StageResult
 from ponn_torch.solving.solution import Solution
-from ponn_torch.solving.solver import Solver, SolveResult
+from ponn_torch.solving.solver import Solver
 
 
 @pytest.fixture(autouse=True)

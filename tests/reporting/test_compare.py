@@ -14,7 +14,7 @@ from ponn_torch.reporting.compare import compare, spread
 from ponn_torch.reporting.members import extremals, read_members
 from ponn_torch.reporting.overlays import histories_figure, solutions_figure
 from ponn_torch.reporting.reference import Reference
-from ponn_torch.solving import solver as solver_module
+from ponn_torch.solving import run as run_module
 from ponn_torch.solving.certificate import Certificate
 from ponn_torch.solving.solution import Solution
 
@@ -30,7 +30,7 @@ def sweep(tmp_path_factory):
     measured = ["record.cost_every=2", f"record.reference='{first}/solution'"]
     judged = Certificate.from_dict(json.loads((first / "certificate.json").read_text(encoding="utf-8")))
     with pytest.MonkeyPatch.context() as patch:  # flying takes longer than all else, and no test is about it
-        patch.setattr(solver_module, "certify", lambda *_: judged)
+        patch.setattr(run_module, "certify", lambda *_: judged)
         code = ponn(["-m", *SMALL, *measured, "ansatz.size=12,16", "seed=0,1", f"hydra.sweep.dir='{folder}/sweep'"])
     assert code == 0
     bad = [*SMALL, "ansatz.size=12", "problem.initial_mass=-1"]

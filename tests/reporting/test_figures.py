@@ -21,7 +21,7 @@ from ponn_torch.reporting.figures import (
 )
 from ponn_torch.reporting.style import component_symbols, costate_unit, decimal_exponent, save, symbol
 from ponn_torch.reporting.trajectories import plane_figure, trajectory_figure
-from ponn_torch.solving.observer import StageResult
+from ponn_torch.solving.result import StageResult
 
 ALWAYS = {"states", "costates", "control", "hamiltonian", "residual", "convergence"}
 APPLY = {

@@ -14,7 +14,7 @@ from ponn_torch.optim.base import Status, Stopping
 from ponn_torch.optim.least_squares import LevenbergMarquardt, ScipyLeastSquares
 from ponn_torch.problems.mars_landing import mars_landing
 from ponn_torch.reporting.records import RECORDS, RunRecorder
-from ponn_torch.solving.observer import StageResult
+from ponn_torch.solving.result import StageResult
 
 STOPPING = Stopping(tolerance=1e-6, decrease=1e-3, max_iterations=60)
 OPTIMIZERS = {"lm": LevenbergMarquardt(STOPPING), "scipy": ScipyLeastSquares("trf", STOPPING)}

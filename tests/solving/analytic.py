@@ -12,11 +12,12 @@ from ponn_torch.ansatz.basis import Chebyshev, FreeFunction
 from ponn_torch.numerics.nodes import make_nodes
 from ponn_torch.optim.base import Stopping
 from ponn_torch.optim.least_squares import LevenbergMarquardt
+from ponn_torch.optimal_control.boundary_value_problem import Setting
 from ponn_torch.optimal_control.collocation import Collocation
 from ponn_torch.optimal_control.control_laws import Box, Regime, Unconstrained
 from ponn_torch.optimal_control.curve import Curve
 from ponn_torch.optimal_control.discretisation import Discretisation
-from ponn_torch.optimal_control.pontryagin import Setting, pontryagin
+from ponn_torch.optimal_control.pontryagin import pontryagin
 from ponn_torch.optimal_control.problem import FreeTime, OptimalControlProblem
 from ponn_torch.solving.guess import project
 from ponn_torch.solving.solution import Solution

@@ -10,9 +10,10 @@ from helpers import ANSATZES, PROBLEMS, bvp_of, collocation, problem, random, re
 from torch import Tensor
 
 from ponn_torch.numerics.nodes import differentiation_matrix, make_nodes
+from ponn_torch.optimal_control.boundary_value_problem import BoundaryValueProblem
 from ponn_torch.optimal_control.collocation import Collocation
 from ponn_torch.optimal_control.curve import Curve
-from ponn_torch.optimal_control.pontryagin import BoundaryValueProblem, pontryagin
+from ponn_torch.optimal_control.pontryagin import pontryagin
 from ponn_torch.solving.guess import DISTRIBUTIONS, RandomGuess, project
 from ponn_torch.solving.paths import PolarTransfer, PoweredDescent, StraightLine
 

@@ -18,10 +18,11 @@ from helpers import random
 from ponn_torch.ansatz.basis import Chebyshev, GaussianRBF, Legendre, RandomFeatures
 from ponn_torch.ansatz.networks import MLP, FrozenMLP
 from ponn_torch.ansatz.switch_neurons import SwitchNeuronBasis
-from ponn_torch.optimal_control.control_laws import REGULARISERS, Regime, make_regulariser
+from ponn_torch.optimal_control.control_laws import Regime
 from ponn_torch.optimal_control.curve import Curve
 from ponn_torch.optimal_control.problem import ProblemOrigin
 from ponn_torch.optimal_control.references import load_problem
+from ponn_torch.optimal_control.regularisers import REGULARISERS, make_regulariser
 from ponn_torch.solving.guess import project
 from ponn_torch.solving.solution import Samples, Solution
 

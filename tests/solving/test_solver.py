@@ -27,8 +27,9 @@ from ponn_torch.solving.guess import RandomGuess, project
 from ponn_torch.solving.observer import Observer
 from ponn_torch.solving.paths import PolarTransfer
 from ponn_torch.solving.refinement import Subdivide
+from ponn_torch.solving.result import SolveResult
 from ponn_torch.solving.solution import Solution
-from ponn_torch.solving.solver import Solver, SolveResult
+from ponn_torch.solving.solver import Solver
 
 DAY = 86400.0
 AU, SUN_GM = 149.59787e9, 1.32712440018e20

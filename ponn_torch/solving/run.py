@@ -1,0 +1,296 @@
+"""One solve: start after start, each through its smoothed stages, the refinement and the certificate."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from ponn_torch.optim.base import Callback, Optimizer, OptimizeResult, Record, Residual, Status, Stop, loosened
+from ponn_torch.optimal_control.collocation import Collocation
+from ponn_torch.optimal_control.curve import Curve
+from ponn_torch.optimal_control.discretisation import Discretisation, Form, Strong
+from ponn_torch.optimal_control.measurements import Measured
+from ponn_torch.optimal_control.pontryagin import pontryagin
+from ponn_torch.optimal_control.problem import OptimalControlProblem
+from ponn_torch.solving import refinement as refinements
+from ponn_torch.solving.budget import Budget
+from ponn_torch.solving.certificate import Certificate, certify
+from ponn_torch.solving.guess import project
+from ponn_torch.solving.journal import Journal
+from ponn_torch.solving.observer import Observer
+from ponn_torch.solving.result import SolveResult, StageResult
+from ponn_torch.solving.solution import Solution
+from ponn_torch.solving.walk import Walk
+
+if TYPE_CHECKING:
+    from ponn_torch.solving.solver import Solver
+
+
+@dataclass(frozen=True)
+class _Iterate:
+    """The best point of an iteration, for observers."""
+
+    collocation: Collocation
+    xi: Tensor
+    residual: Tensor
+    equations: Residual
+
+    def blocks(self) -> Mapping[str, float]:
+        return {name: float(value) for name, value in self.equations.blocks(self.residual).items()}
+
+    def cost(self) -> float:
+        return float(self.collocation.cost(self.xi))
+
+    def curve(self) -> Curve:
+        return Curve(self.collocation, self.xi)
+
+
+class _Interrupted(Exception):
+    """Ctrl-C reached an optimiser, which gave its best point back."""
+
+
+class Run:
+    """One solve: holds the stages so far, so that nothing computed is lost whatever ends it."""
+
+    def __init__(
+        self,
+        solver: Solver,
+        problem: OptimalControlProblem,
+        seed: int,
+        observer: Observer,
+        journal: Journal | None = None,
+    ) -> None:
+        self.solver, self.problem, self.seed, self.observer = solver, problem, seed, observer
+        self.bvp = pontryagin(problem, mass_variable=solver.mass_variable, dtype=solver.dtype, device=solver.device)
+        self.discretisations: dict[Form, Discretisation] = {}
+        self.stages: list[StageResult] = []
+        self.start = 0
+        self.refused: list[Tensor] = []  # where smoothed solutions began whose refinement failed
+        self.note = ""
+        self.clock, self.journal = Budget(solver.cpu_seconds), journal
+        self.measurements = None if solver.data is None else solver.data.of(problem)
+
+    # -- the line ------------------------------------------------------------------------------------------------------
+
+    def result(self) -> SolveResult:
+        best: tuple[Solution, Certificate] | None = None
+        guess: Tensor | None = None
+        message, verdict, interrupted, n_certified = "", "", False, 0
+        try:
+            for start in range(self.solver.n_starts):
+                with self.clock:
+                    first_stage, xi = self._guessed(start)
+                    if guess is not None and torch.equal(xi, guess):
+                        break
+                    guess = xi if guess is None else guess
+                    self.start = start
+                    candidate, note = self._one_start(first_stage, xi)
+                message = note or message
+                if candidate is None:
+                    if self.clock.spent:
+                        break
+                    continue
+                judged = certify(candidate, self.solver.tolerances)
+                n_certified += judged.certified
+                if best is None or _better(judged, best[1]):
+                    best, message = (candidate, judged), note or judged.verdict
+                    verdict = message
+                # a start that came through its stages is the answer where nothing aims at a certificate
+                enough = n_certified if self.solver.exact else 1
+                if enough >= self.solver.n_certified or self.clock.spent:
+                    break
+        except (_Interrupted, KeyboardInterrupt):
+            interrupted, message = True, "interrupted; the best stage so far is kept"
+        if best is not None and best[1].certified and not interrupted:
+            message = verdict if n_certified == 1 else f"{verdict}; the cheapest of {n_certified} certified starts"
+        spent = self.clock.spent and n_certified < self.solver.n_certified
+        if spent and not (best and best[1].certified) and Status.BUDGET.value not in message:
+            message = f"{Status.BUDGET.value}: {message}"
+        solution = best[0] if best else self._last_stage()
+        if solution is not None:
+            self.observer.solution(solution)
+        if best is not None:
+            self.observer.certificate(best[1])
+        else:
+            self.observer.failed(message)
+        certificate = best[1] if best else None
+        seconds = self.clock.seconds
+        return SolveResult(solution, certificate, self.stages, self.start + 1, message, seconds, interrupted, spent)
+
+    def _guessed(self, start: int) -> tuple[Collocation, Tensor]:
+        """The collocation of the first stage, and a start's guess projected on it."""
+        like = self.bvp.unit
+        share = torch.linspace(0.0, 1.0, self.solver.n_segments + 1, dtype=like.dtype, device=like.device)
+        collocation = Collocation.on_segments(self.discretisation(None), share * self.bvp.final_time)
+        if self.smoothable:
+            collocation = collocation.with_setting(smoothing=1.0)
+        return collocation, project(collocation, self.solver.guess.curve(self.bvp, 1000 * self.seed + start))
+
+    def _one_start(self, collocation: Collocation, xi: Tensor) -> tuple[Solution | None, str]:
+        """Everything between a first guess and a trajectory to be judged; None and why where that fails."""
+        stages, message = self._continuation(collocation, xi)
+        if not stages:
+            return None, message
+        smoothed = stages[-1]
+        start = smoothed.curve.knots[0]
+        if any(float((start - other).abs().max()) < 1e-5 * float(start.abs().max()) for other in self.refused):
+            return None, f"start {self.start + 1} led to the same smoothed solution as one before: {self.note}"
+        refined, self.note = self._refined(stages)
+        if self.note:
+            self.refused.append(start)
+        return refined, self.note
+
+    def _last_stage(self) -> Solution | None:
+        solutions = [s.solution for s in self.stages if s.solution is not None]
+        return solutions[-1] if solutions else None
+
+    # -- smoothed stages ---------------------------------------------------------------------------------------------
+
+    def discretisation(self, form: Form | None) -> Discretisation:
+        key = form or self.solver.form
+        if key not in self.discretisations:
+            self.discretisations[key] = self.solver.discretisation(self.bvp, key)
+        return self.discretisations[key]
+
+    @property
+    def smoothable(self) -> bool:
+        return self.bvp.law.n_switching > 0 and not self.bvp.law.curved
+
+    @property
+    def reads_arcs(self) -> bool:
+        return self.solver.refinement is not None and self.solver.refinement.reads_arcs
+
+    @property
+    def stage_optimizer(self) -> Optimizer:
+        """A refinement that reads arcs solves everything anew: digits of the curve it starts from are wasted."""
+        solver = self.solver
+        return loosened(solver.optimizer, solver.stage_tolerance) if self.reads_arcs else solver.optimizer
+
+    def _continuation(self, collocation: Collocation, xi: Tensor) -> tuple[list[Solution], str]:
+        """Walk the schedule from one start; the stages that can be trusted, the sharpest last, or none and why."""
+        walk = Walk(self, collocation, xi)
+        self.solver.continuation.run(walk)
+        return walk.kept, walk.message
+
+    def coarse(self, result: OptimizeResult) -> bool:
+        """Whether a stage of large residual is best as it is: nothing is bounded, and the iteration has settled.
+
+        Another start would settle at the same curve; more segments do not.
+        """
+        return self.solver.exact and self.bvp.law.n_switching == 0 and result.status.stationary
+
+    def trusted(self, solution: Solution) -> bool:
+        """Whether the stage's equations hold between the nodes too (a weak form claims its moments only).
+
+        A refinement that reads no arcs off the curve may start from any stage: a coarse one needs more segments.
+        """
+        refinement = self.solver.refinement
+        if refinement is not None and not refinement.reads_arcs:
+            return True
+        if not isinstance(solution.curve.collocation.discretisation.form, Strong):
+            return True
+        return solution.off_node_residual <= self.solver.trust * solution.curve.largest_rate
+
+    def blunter(self, stages: Sequence[Solution]) -> Curve | None:
+        """The stage before the last, if it was smoothed more."""
+        curves = [stage.curve for stage in stages[-2:]]
+        return curves[0] if curves[0].smoothing > curves[-1].smoothing else None
+
+    # -- refinement ---------------------------------------------------------------------------------------------------
+
+    def _refined(self, stages: Sequence[Solution]) -> tuple[Solution, str]:
+        """The refined solution where the refinement succeeds or improves, else the smoothed one and why."""
+        refinement, smoothed = self.solver.refinement, stages[-1]
+        if refinement is None:
+            return smoothed, ""
+        name = type(refinement).__name__.lower()
+        self.observer.stage_started(name, None, len(self.stages))
+        refined = refinement.run(smoothed.curve, self._callback, self.blunter(stages))
+        improved = refined.curve is not smoothed.curve
+        for result in refined.rounds:
+            if not improved or result is not refined.result:
+                self._stage(name, None, result, float("nan"), float("nan"), None)
+        solution = self.record(name, refined.curve, refined.result) if improved else smoothed
+        if refined.outcome is refinements.Outcome.INTERRUPTED and not self.clock.spent:
+            raise _Interrupted
+        if refined.outcome is refinements.Outcome.SOLVED or (improved and not refinement.exact):
+            return solution, ""
+        return smoothed, f"{name}: {refined.message}"
+
+    # -- bookkeeping -------------------------------------------------------------------------------------------------
+
+    def _callback(self, collocation: Collocation, residual: Residual | None = None) -> Callback:
+        """Tell the observer of an optimiser's iterations, and end the run when its time is spent."""
+
+        equations = residual or collocation
+
+        def on_iteration(record: Record, xi: Tensor, residual: Tensor) -> None:
+            self.observer.iteration(record, _Iterate(collocation, xi, residual, equations))
+            if self.clock.spent:
+                raise Stop(Status.BUDGET)
+
+        return on_iteration
+
+    def optimise(self, name: str, collocation: Collocation, xi: Tensor, optimizer: Optimizer) -> OptimizeResult:
+        self.observer.stage_started(name, collocation.smoothing or None, len(self.stages))
+        measured = self.measurements
+        residual: Residual = collocation if measured is None else Measured(collocation, measured)
+        told = self._callback(collocation, residual)
+        if self.journal is None:
+            result = optimizer.run(residual, xi, told)
+        else:
+            result = self.journal.run(optimizer, residual, xi, told, self.clock.add)
+        if result.status is Status.INTERRUPTED:
+            self.record(name, Curve(collocation, result.xi), result)
+            raise _Interrupted
+        return result
+
+    def record(self, name: str, curve: Curve, result: OptimizeResult) -> Solution:
+        solution = Solution(curve)
+        self._stage(
+            name,
+            curve.smoothing or None,
+            result,
+            solution.off_node_residual,
+            float(curve.collocation.cost(curve.xi)),
+            solution,
+        )
+        return solution
+
+    def _stage(
+        self,
+        name: str,
+        smoothing: float | None,
+        result: OptimizeResult,
+        off_node_residual: float,
+        cost: float,
+        solution: Solution | None,
+    ) -> None:
+        stage = StageResult(
+            name=name,
+            smoothing=smoothing,
+            status=result.status,
+            norm=float(result.norm),
+            n_iterations=result.n_iterations,
+            n_residuals=result.n_residuals,
+            n_linearisations=result.n_linearisations,
+            cpu_seconds=result.cpu_seconds,
+            off_node_residual=off_node_residual,
+            cost=cost,
+            records=result.records,
+            start=self.start,
+            solution=solution,
+        )
+        self.stages.append(stage)
+        self.observer.stage_ended(stage)
+
+
+def _better(one: Certificate, other: Certificate) -> bool:
+    """Certified before not, then cheaper; of two that are not, the one found first stays."""
+    if one.certified != other.certified:
+        return one.certified
+    return one.certified and one.cost < other.cost

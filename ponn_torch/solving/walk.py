@@ -1,0 +1,91 @@
+"""One start on its way down the schedule of smoothings: what it has solved, and which stages can be trusted."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING
+
+from torch import Tensor
+
+from ponn_torch.optim.base import NonFiniteResidual, OptimizeResult, warm
+from ponn_torch.optimal_control.collocation import Collocation
+from ponn_torch.optimal_control.curve import Curve
+from ponn_torch.optimal_control.discretisation import Form
+from ponn_torch.solving.continuation import Outcome
+from ponn_torch.solving.sharpening import legible
+from ponn_torch.solving.solution import Solution
+
+if TYPE_CHECKING:
+    from ponn_torch.solving.run import Run
+
+
+@dataclass
+class Walk:
+    """One start on its way down the schedule: where it stands, and the stages so far that can be trusted.
+
+    n_failed: first stages that failed; until one has not, the walk has not begun.
+    """
+
+    run: Run
+    collocation: Collocation
+    xi: Tensor
+    kept: list[Solution] = field(default_factory=list)
+    message: str = ""
+    begun: bool = False
+    n_failed: int = 0
+
+    def __call__(self, value: float, parameter: str, form: Form | None, *, hold: bool = False) -> Outcome:
+        """Solve one stage from where the walk stands; ``hold``: stay there if it cannot be trusted."""
+        run, smoothed = self.run, self.run.smoothable or parameter != "smoothing"
+        if self.begun and (run.clock.spent or not smoothed):  # nothing to smooth: one stage is all there is
+            return Outcome.ABORT
+        trial = replace(self.collocation, discretisation=run.discretisation(form))
+        if smoothed:
+            trial = trial.with_setting(**{parameter: value})
+        optimizer = run.stage_optimizer
+        if self.begun:
+            optimizer = warm(optimizer, run.solver.warm_damping)
+        try:
+            result = run.optimise("smooth", trial, self.xi, optimizer)
+        except NonFiniteResidual as error:
+            self.message = str(error)
+            return Outcome.FAILED if self.begun else Outcome.ABORT
+        solution = run.record("smooth", Curve(trial, result.xi), result)
+        # measurements need not fit: what counts are the equations
+        norm = float(result.norm if run.measurements is None else trial.residual(result.xi).norm())
+        if norm < run.solver.start_limit:
+            return self._advanced(trial, result.xi, solution, hold)
+        return Outcome.FAILED if self.begun else self._not_begun(solution, result, norm, parameter)
+
+    def _advanced(self, trial: Collocation, xi: Tensor, solution: Solution, hold: bool) -> Outcome:
+        """A stage that is solved: the walk goes there, and keeps it if it can be trusted."""
+        run, self.begun = self.run, True
+        trusted = run.trusted(solution)
+        if hold and not trusted:
+            return Outcome.UNTRUSTED
+        change = float((xi - self.xi).abs().max())
+        self.collocation, self.xi = trial, xi
+        if trusted or not self.kept:
+            self.kept.append(solution)
+        if not trusted and len(self.kept) == 1:
+            self.message = "no stage solves its own problem between the nodes; the first one is kept"
+        if change < 1e-6 * float(xi.abs().max()):
+            return Outcome.UNCHANGED
+        if trusted and run.reads_arcs and (blunter := run.blunter(self.kept)):
+            return Outcome.LEGIBLE if legible(solution.curve, blunter) else Outcome.SOLVED
+        return Outcome.SOLVED if trusted else Outcome.UNTRUSTED
+
+    def _not_begun(self, solution: Solution, result: OptimizeResult, norm: float, parameter: str) -> Outcome:
+        """A first stage that failed; at the next smoothing it is tried once more."""
+        run = self.run
+        if run.coarse(result):
+            self.kept.append(solution)  # what a refinement on segments starts from, if not a solution
+            return Outcome.ABORT
+        self.message = (
+            f"start {run.start + 1} of seed {run.seed} failed: ‖r‖ = {norm:.2g} "
+            f"after the {('first', 'second')[self.n_failed]} stage ({result.status.value})"
+        )
+        self.n_failed += 1
+        # smoothed less, the problem may have a solution, or one that is nearer to this guess
+        again = self.n_failed == 1 and run.smoothable and parameter == "smoothing" and not run.clock.spent
+        return Outcome.FAILED if again else Outcome.ABORT
