@@ -47,7 +47,7 @@ class Collocation:
     Attributes:
         known_knots: (..., K+1, 2n) scaled values; NaN marks an unknown entry, the same in the whole batch.
         known_times: (..., K+1) scaled, ascending; first guesses of those that are unknown.
-        events: per interior knot, the index of the switching function that vanishes there, its time unknown; or
+        events: per interior knot, the indices of the switching functions that vanish there, its time unknown; or
             None: the knot only subdivides, at the same fraction of the way between its neighbouring switches or ends.
         setting: the regime (smoothing (...,), or arc codes (..., K, m)) and parameters (...,) by name.
     """
@@ -56,7 +56,7 @@ class Collocation:
     known_knots: Tensor
     known_times: Tensor
     setting: Setting
-    events: tuple[int | None, ...] = ()
+    events: tuple[tuple[int, ...] | None, ...] = ()
 
     def __post_init__(self) -> None:
         if len(self.events) != self.n_segments - 1:
@@ -72,18 +72,18 @@ class Collocation:
         times: Tensor,
         *,
         setting: Setting | None = None,
-        events: Sequence[int | None] | None = None,
+        events: Sequence[Sequence[int] | None] | None = None,
     ) -> Collocation:
         """Segments between scaled ``times`` (K+1,), interior knot values unknown."""
         bvp = discretisation.bvp
         n_segments = times.shape[-1] - 1
-        events = tuple(events) if events is not None else (None,) * (n_segments - 1)
+        what = (None,) * (n_segments - 1) if events is None else (e if e is None else tuple(e) for e in events)
         knots = torch.full((n_segments + 1, bvp.dimension), torch.nan, dtype=times.dtype, device=times.device)
         knots[0], knots[-1] = bvp.known_initial, bvp.known_final
         setting = setting or Setting()
         missing = {k: times.new_tensor(v) for k, v in bvp.problem.parameters.items() if k not in setting.parameters}
         setting = replace(setting, parameters={**missing, **setting.parameters})
-        return cls(discretisation, knots, times, setting, events)
+        return cls(discretisation, knots, times, setting, tuple(what))
 
     def with_setting(self, *, smoothing: float | Tensor | None = None, **parameters: float | Tensor) -> Collocation:
         """The same residual at another smoothing, fixed final time (s), or other values of named parameters.
@@ -394,26 +394,32 @@ class Collocation:
 
     @property
     def switch_knots(self) -> list[int]:
-        """Interior knots with a switching row."""
+        """Interior knots at which the control switches."""
         return [i + 1 for i, event in enumerate(self.events) if event is not None]
 
     @cached_property
     def _switches(self) -> Tensor:
         return torch.tensor(self.switch_knots, dtype=torch.long, device=self.known_times.device)
 
+    @cached_property
+    def _vanishing(self) -> list[tuple[int, int]]:
+        """Per switching row its switch and its switching function: components may switch together."""
+        switches = [event for event in self.events if event is not None]
+        return [(i, function) for i, event in enumerate(switches) for function in event]
+
     @property
     def n_extra(self) -> int:
-        return len(self.switch_knots) + self.bvp.n_terminal_rows
+        return len(self._vanishing) + self.bvp.n_terminal_rows
 
     def _extra_rows(self, knots: Tensor, times: Tensor, multipliers: Tensor) -> Tensor:
         rows, switches = [], self._switches
         regime = self.setting.regime
         if len(switches):
-            chosen = [event for event in self.events if event is not None]
             t, w = times.index_select(-1, switches).unsqueeze(-1), knots.index_select(-2, switches)
             parameters = {k: v[..., None, None].expand(t.shape) for k, v in self.setting.parameters.items()}
             switching = self.bvp.switching(t, w, Setting(Regime(), parameters))
-            rows.append(switching[..., range(len(chosen)), chosen])
+            which, functions = zip(*self._vanishing, strict=True)
+            rows.append(switching[..., which, functions])
         if self.bvp.n_terminal_rows:
             t, w = times[..., -1:], knots[..., -1, :]
             smoothing = None if regime.smoothing is None else regime.smoothing[..., None].expand(t.shape)
@@ -447,7 +453,7 @@ class Collocation:
             norms = chains.square().sum((-1, -3)).sqrt()
             for i, column in enumerate(group.columns[:, -1].tolist()):
                 out[names[column]] = norms[..., i]
-        n_switching = len(self.switch_knots)
+        n_switching = len(self._vanishing)
         if n_switching:
             out["switching"] = extra[..., :n_switching].norm(dim=-1)
         if self.bvp.n_terminal_rows:

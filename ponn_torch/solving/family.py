@@ -193,7 +193,7 @@ class Family:
         steps = [torch.arange(1, n + 1, dtype=ends.dtype, device=ends.device) / n for n in counts]
         cuts = [ends[:, i, None] + step * ends.diff(dim=-1)[:, i, None] for i, step in enumerate(steps)]
         times = torch.cat([ends[:, :1], *cuts], -1)
-        events: list[int | None] = []
+        events: list[tuple[int, ...] | None] = []
         for n, knot in zip(counts, [*self.arc_knots[passed + 1 : -1], None], strict=True):
             events += [None] * (n - 1) + ([made.events[knot - 1]] if knot is not None else [])
         regime, arcs = made.setting.regime, None

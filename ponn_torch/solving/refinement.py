@@ -143,17 +143,17 @@ class Segmentation:
 
 @dataclass(frozen=True)
 class Segments:
-    """Knot times (K+1,), the event of every interior knot or None where it only subdivides, arc codes (K, m)."""
+    """Knot times (K+1,), the events of every interior knot or None where it only subdivides, arc codes (K, m)."""
 
     times: Tensor
-    events: tuple[int | None, ...]
+    events: tuple[tuple[int, ...] | None, ...]
     arcs: Tensor
 
     def halved(self, which: Tensor) -> Segments:
         """Cut the chosen segments, booleans (K,), in two."""
         k, chosen = len(self.arcs), which.tolist()
         times, codes = [self.times[0]], []
-        events: list[int | None] = []
+        events: list[tuple[int, ...] | None] = []
         for i in range(k):
             if chosen[i]:
                 times.append(0.5 * (self.times[i] + self.times[i + 1]))

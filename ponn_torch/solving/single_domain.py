@@ -47,8 +47,10 @@ def find_layers(curve: Curve, smoothing: Tensor | None) -> Layers:
         return Layers(start.new_zeros(0), start.new_zeros(0))
     step = 1e-5 * half
     before, after = (switching_along(curve, (structure.times + d).clamp(start, end)) for d in (-step, step))
-    event = torch.tensor(structure.events, dtype=torch.long, device=start.device)[:, None]
-    slopes = ((after - before).gather(1, event)[:, 0] / (2 * step)).abs() * half
+    steepest = torch.stack(
+        [(row[list(event)]).abs().amax() for row, event in zip(after - before, structure.events, strict=True)]
+    )
+    slopes = steepest / (2 * step) * half
     return Layers((structure.times - start) / half - 1.0, (smoothing / slopes).clamp_max(1.0))
 
 

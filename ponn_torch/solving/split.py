@@ -192,7 +192,7 @@ def _spread(structure: Structure, times: Tensor, n_segments: int) -> Segments:
     ends = torch.cat([times[:1], structure.times, times[-1:]])
     counts = shared_out(ends.diff().tolist(), n_segments)
     knots, codes = [ends[:1]], []
-    events: list[int | None] = []
+    events: list[tuple[int, ...] | None] = []
     for i, count in enumerate(counts):
         steps = torch.arange(1, count + 1, dtype=ends.dtype, device=ends.device) / count
         knots.append(ends[i] + steps * (ends[i + 1] - ends[i]))

@@ -118,7 +118,7 @@ def load_curve(folder: Path, problem: OptimalControlProblem | None = None) -> Cu
         known_knots=arrays["known_knots"],
         known_times=arrays["known_times"],
         setting=Setting(Regime(arrays.get("smoothing"), arrays.get("arcs")), _under("parameter", arrays)),
-        events=tuple(description["events"]),
+        events=tuple(event if event is None else tuple(event) for event in description["events"]),
     )
     curve = Curve(collocation, xi)
     _check(curve, _under("check", arrays), folder)

@@ -16,11 +16,11 @@ from ponn_torch.optimal_control.curve import Curve
 
 @dataclass(frozen=True)
 class Structure:
-    """Arcs of a bounded control: codes (K, m), scaled times of the K−1 switches, and what switches there."""
+    """Arcs of a bounded control: codes (K, m), scaled times of the K−1 switches, and which S vanish there."""
 
     arcs: Tensor
     times: Tensor
-    events: tuple[int, ...]
+    events: tuple[tuple[int, ...], ...]
 
     def __len__(self) -> int:
         return self.arcs.shape[0]
@@ -103,11 +103,8 @@ def find_structure(curve: Curve, blunter: Curve | None = None, *, n_points: int 
     ends = torch.cat([curve.times[:1], root, curve.times[-1:]])
     middle = 0.5 * (ends[1:] + ends[:-1])
     arcs = curve.collocation.bvp.law.arc_codes(switching(middle))
-    keep = (arcs[1:] != arcs[:-1]).any(-1)
-    arcs = torch.cat([arcs[:1], arcs[1:][keep]])
-    structure = Structure(arcs, root[keep], tuple(event[keep].tolist()))
-    # S = 0 at an end of the time, up to round-off of either sign, would open an arc without duration
-    return without_short_arcs(structure, torch.cat([ends[:1], root[keep], ends[-1:]]), 1e-12)
+    # S = 0 at an end of the time, or two S at once, up to round-off of either sign, would open an arc without duration
+    return without_short_arcs(Structure(arcs, root, tuple((e,) for e in event.tolist())), ends, 1e-12)
 
 
 def _linear(t: Tensor, values: Tensor, at: Tensor) -> Tensor:
@@ -118,7 +115,10 @@ def _linear(t: Tensor, values: Tensor, at: Tensor) -> Tensor:
 
 
 def without_short_arcs(structure: Structure, knot_times: Tensor, fraction: float) -> Structure:
-    """Merge away arcs shorter than ``fraction`` of the whole; neighbours that then agree become one arc."""
+    """Merge away arcs shorter than ``fraction`` of the whole; neighbours that then agree become one arc.
+
+    Where they differ in several components, these switch together.
+    """
     durations = knot_times[1:] - knot_times[:-1]
     keep = (durations > fraction * (knot_times[-1] - knot_times[0])).nonzero()[:, 0].tolist()
     if not keep:
@@ -129,7 +129,10 @@ def without_short_arcs(structure: Structure, knot_times: Tensor, fraction: float
             continue
         # the arcs between the two are gone: one switch in the middle of where they were
         times.append(0.5 * (knot_times[before + 1] + knot_times[after]))
-        events.append(structure.events[after - 1])
+        # of the functions of a component that vanished there, the last one
+        gone = {e % len(arcs[-1]): e for event in structure.events[before:after] for e in event}
+        changed = (structure.arcs[after] != arcs[-1]).nonzero()[:, 0].tolist()
+        events.append(tuple(gone.get(component, component) for component in changed))
         arcs.append(structure.arcs[after])
     merged = torch.stack(times) if times else structure.times[:0]
     return Structure(torch.stack(arcs), merged, tuple(events))
@@ -186,7 +189,7 @@ def needles(curve: Curve, width: float, tolerance: float) -> list[Structure]:
             elif int(points[0]) == 0:
                 new, pieces = [float(ends[0]) + length], pieces[1:]
             switches = torch.cat([ends[1 : k + 1], ends.new_tensor(new), ends[k + 1 : -1]])
-            what = (*events[:k], *[event] * len(new), *events[k:])
+            what = (*events[:k], *[(event,)] * len(new), *events[k:])
             found.append((float(column[peak]), Structure(torch.cat(pieces), switches, what)))
     return [structure for _, structure in sorted(found, key=lambda pair: -pair[0])]
 

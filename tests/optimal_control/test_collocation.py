@@ -43,7 +43,7 @@ def with_arcs(made: Collocation, codes: list[list[int]]) -> Collocation:
 
 
 def on_times(
-    bvp: BoundaryValueProblem, fractions: list[float], events: list[int | None], codes, form=FORMS["strong"]
+    bvp: BoundaryValueProblem, fractions: list[float], events: list[tuple[int, ...] | None], codes, form=FORMS["strong"]
 ) -> Collocation:
     """Segments between fractions of the final time, on arcs."""
     disc = Discretisation(bvp, Chebyshev(4), make_nodes("legendre_gauss", 6, dtype=torch.float64), form, "columns")
@@ -99,7 +99,7 @@ def test_a_residual_that_is_asked_for_often_is_played_from_a_tape(name):
 
 def test_arcs_with_subdivisions_are_played_for_other_times_arcs_and_fractions():
     bvp = bvp_of("tfc_test_1")
-    events = [None, 0, None]
+    events = [None, (0,), None]
     made = on_times(bvp, [0.0, 0.2, 0.5, 0.7, 1.0], events, [[0], [0], [2], [2]])
     other = on_times(bvp, [0.0, 0.3, 0.4, 0.5, 1.0], events, [[2], [2], [0], [0]])
     check_tapes(made, replace(other, discretisation=made.discretisation))
@@ -436,7 +436,7 @@ def test_a_vanishing_segment_does_not_hide_a_jump(length):
     disc = Discretisation(bvp, Chebyshev(6), make_nodes("legendre_gauss", 9, dtype=torch.float64))
     guess = torch.tensor([0.0, 2.0, 3.0], dtype=torch.float64)
     setting = Setting(Regime(arcs=torch.tensor([[0], [2]])))
-    made = Collocation.on_segments(disc, guess, events=[0], setting=setting)
+    made = Collocation.on_segments(disc, guess, events=[(0,)], setting=setting)
     unknowns = made.unpack(torch.zeros(made.n_unknowns, dtype=torch.float64))
     unknowns.knots[1, :2] = torch.tensor([1.0, 0.5])
     assert unknowns.knots[2, :2].tolist() == [1.0, 0.0]

@@ -32,7 +32,7 @@ def on_arcs(network: FreeFunction, form: Form) -> Collocation:
     bvp = pontryagin(ferry(free_final_time=True))
     disc = Discretisation(bvp, network, make_nodes("legendre_gauss", 6, dtype=torch.float64), form)
     times = torch.tensor([0, 0.2, 0.5, 0.6, 1.0], dtype=torch.float64) * bvp.final_time
-    made = Collocation.on_segments(disc, times, events=[0, None, 0])
+    made = Collocation.on_segments(disc, times, events=[(0,), None, (0,)])
     return replace(made, setting=replace(made.setting, regime=Regime(arcs=torch.tensor([[2], [0], [0], [2]]))))
 
 

@@ -76,7 +76,7 @@ def test_rows_of_measurements_are_exact():
 
 def test_a_measurement_at_a_free_knot_has_the_slope_of_its_segment():
     made = collocation(bvp_of("minimum_time"), n_segments=2)
-    made = replace(made, events=(0,), setting=Setting(Regime(arcs=torch.tensor([[2], [0]]))))
+    made = replace(made, events=((0,),), setting=Setting(Regime(arcs=torch.tensor([[2], [0]]))))
     xi = random(made.n_unknowns, seed=3)
     column, end = made.n_weights + len(made.free_knots), float(made.known_times[-1])
     xi[column : column + 2] = torch.tensor([0.5 * end, end])  # the switch is at the measurement in the middle

@@ -154,7 +154,7 @@ def solve(
     n_nodes: int = 20,
     switches: Sequence[float] = (),
     arcs: Sequence[int] | None = None,
-    events: Sequence[int | None] | None = None,
+    events: Sequence[Sequence[int] | None] | None = None,
     smoothing: float | None = None,
     conditioning: str = "columns",
     mass_variable: str = "auto",
@@ -170,7 +170,7 @@ def solve(
         arcs=None if arcs is None else torch.tensor(arcs)[:, None],
     )
     times = torch.tensor([0.0, *switches, bvp.final_time], dtype=dtype)
-    events = events if events is not None else [0] * len(switches)
+    events = events if events is not None else [(0,)] * len(switches)
     collocation = Collocation.on_segments(disc, times, events=events, setting=Setting(regime))
     start, end = (torch.tensor(values, dtype=dtype) for values in guess)
     xi = project(collocation, lambda t: start + (end - start) * (t / times[-1])[:, None])
@@ -185,7 +185,7 @@ def solve_saturated(codes: Sequence[int] = (2, 1, 0)) -> Solution:
         [[0.0, 0, -6, -6], [1.0, 0, -6, 6]],
         switches=[0.1, 0.9],
         arcs=codes,
-        events=[1, 0],
+        events=[(1,), (0,)],
     )
 
 

@@ -43,7 +43,7 @@ def split_landing(smoothed_landing: Solution) -> Solution:
     disc = Discretisation(bvp, Chebyshev(20), make_nodes("legendre_gauss", 30), conditioning="columns")
     times = torch.tensor([0.0, 31.0, 39.0, bvp.final_time * bvp.time_unit], dtype=torch.float64) / bvp.time_unit
     setting = Setting(Regime(arcs=torch.tensor([[2], [0], [2]])))
-    collocation = Collocation.on_segments(disc, times, events=[0, 0], setting=setting)
+    collocation = Collocation.on_segments(disc, times, events=[(0,), (0,)], setting=setting)
     xi = project(collocation, smoothed_landing.curve)
     result = LevenbergMarquardt(Stopping(tolerance=1e-13, decrease=1e-5), damping=1e-8).run(collocation, xi)
     return Solution(Curve(collocation, result.xi))

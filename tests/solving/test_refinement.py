@@ -51,7 +51,7 @@ def blunt_split() -> tuple[Collocation, Curve]:
     nodes = make_nodes("legendre_gauss", 44, dtype=torch.float64)
     disc = Discretisation(start.collocation.bvp, Chebyshev(30), nodes, conditioning="orthonormal")
     times = torch.cat([start.times[:1], structure.times, start.times[-1:]])
-    made = Collocation.on_segments(disc, times, events=[0, 0], setting=Setting(Regime(arcs=structure.arcs)))
+    made = Collocation.on_segments(disc, times, events=[(0,), (0,)], setting=Setting(Regime(arcs=structure.arcs)))
     stopping = Stopping(tolerance=1e-12, decrease=1e-2, max_iterations=60)
     result = LevenbergMarquardt(stopping, damping=1e-8).run(made, project(made, start))
     assert float(result.norm) < 1e-7

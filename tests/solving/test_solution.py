@@ -207,7 +207,7 @@ def test_arcs_events_and_free_times_come_back(tmp_path):
     solution.save(tmp_path)
     again = Solution.load(tmp_path, problem=solution.problem)
     assert (again.kind, again.arcs, again.switch_times) == ("split", solution.arcs, solution.switch_times)
-    assert again.curve.collocation.events == (1, 0)
+    assert again.curve.collocation.events == ((1,), (0,))
     residual = solution.curve.collocation.residual(solution.curve.xi)
     assert torch.equal(again.curve.collocation.residual(again.curve.xi), residual)
 

@@ -15,10 +15,10 @@ from helpers import PROBLEMS, PROBLEMS_WITH_ANSWERS, bvp_of, collocation, mass_v
 from ponn_torch.ansatz.basis import Chebyshev, Legendre, RandomFeatures
 from ponn_torch.optim.base import Status, Stopping
 from ponn_torch.optim.least_squares import LevenbergMarquardt
-from ponn_torch.optimal_control.control_laws import Unconstrained
+from ponn_torch.optimal_control.control_laws import Box, Unconstrained
 from ponn_torch.optimal_control.curve import Curve
 from ponn_torch.optimal_control.pontryagin import pontryagin
-from ponn_torch.optimal_control.problem import OptimalControlProblem
+from ponn_torch.optimal_control.problem import FreeTime, OptimalControlProblem
 from ponn_torch.problems.boundary_layer import boundary_layer, exact_cost
 from ponn_torch.problems.earth_mars import EARTH_VENUS
 from ponn_torch.solving.certificate import certify
@@ -577,3 +577,23 @@ def test_stages_that_lead_to_a_split_end_early_and_others_do_not():
     assert split.certified
     assert 1e-6 < split.stages[0].norm < 1e-4
     assert alone.stages[0].norm < 1e-6
+
+
+def test_components_that_switch_together_share_a_knot():
+    """Two carts, each to be moved by one in minimum time: thrust, and brake from 1 s on."""
+    twins = OptimalControlProblem(
+        name="twins",
+        states={"r": 2, "v": 2},
+        control=Box("a", 1.0, -1.0, size=2),
+        dynamics=lambda t, x, u, p: {"r": x.v, "v": u.a},
+        running_cost=lambda t, x, u, p: torch.ones_like(u.a[..., :1]),
+        initial={"r": -1.0, "v": 0.0},
+        final={"r": 0.0, "v": 0.0},
+        final_time=FreeTime(2.5),
+    )
+    result = Solver().solve(twins)
+    assert result.certified, result.message
+    assert result.solution.arcs == ["max,max", "min,min"]
+    assert result.solution.curve.collocation.events.count((0, 1)) == 1
+    assert result.solution.switch_times == pytest.approx([1.0], abs=1e-10)
+    assert result.solution.cost == pytest.approx(2.0, abs=1e-10)

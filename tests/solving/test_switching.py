@@ -49,7 +49,7 @@ def with_costate(costate: Callable[[Tensor], Tensor]) -> Curve:
 def test_zeros_are_found_to_round_off():
     structure = find_structure(with_costate(lambda t: SLOPE * (t - 1.5)))
     assert structure.arcs.flatten().tolist() == [UPPER, LOWER, UPPER]
-    assert structure.events == (0, 0)
+    assert structure.events == ((0,), (0,))
     assert structure.times.tolist() == pytest.approx([PUSH, 3 - PUSH], abs=1e-13)
 
 
@@ -102,7 +102,7 @@ def exact_split() -> tuple[Collocation, Tensor]:
     bvp = bvp_of("minimum_fuel")
     disc = Discretisation(bvp, Chebyshev(6), make_nodes("legendre_gauss", 9, dtype=torch.float64))
     times = torch.tensor([0.0, PUSH, 3 - PUSH, 3.0], dtype=torch.float64)
-    made = Collocation.on_segments(disc, times, events=[0, 0])
+    made = Collocation.on_segments(disc, times, events=[(0,), (0,)])
     made = replace(made, setting=replace(made.setting, regime=Regime(arcs=torch.tensor([[2], [0], [2]]))))
 
     def exact(t: Tensor) -> Tensor:
@@ -163,7 +163,7 @@ def test_components_of_a_convex_box_switch_one_by_one():
     structure = find_structure(curve)
     assert structure.arcs.tolist() == [[LOWER, INTERIOR], [INTERIOR, INTERIOR], [UPPER, INTERIOR]]
     assert structure.times.tolist() == pytest.approx([0.5, 1.5], abs=1e-12)
-    assert structure.events == (0, 2)  # the lower bound's function of component 0, then its upper one
+    assert structure.events == ((0,), (2,))  # the lower bound's function of component 0, then its upper one
 
 
 # -- short arcs ----------------------------------------------------------------------------------------------
@@ -171,7 +171,7 @@ def test_components_of_a_convex_box_switch_one_by_one():
 
 def structure_of(codes: list[int], switches: list[float]) -> Structure:
     times = torch.tensor(switches, dtype=torch.float64)
-    return Structure(torch.tensor(codes)[:, None], times, tuple(range(len(switches))))
+    return Structure(torch.tensor(codes)[:, None], times, tuple((i,) for i in range(len(switches))))
 
 
 SHORT = [
@@ -192,7 +192,17 @@ def test_short_arcs_are_merged_away(codes, knots, left, switches, events):
     merged = without_short_arcs(structure_of(codes, knots[1:-1]), times, 0.01)
     assert merged.arcs.flatten().tolist() == left
     assert merged.times.tolist() == pytest.approx(switches)
-    assert merged.events == events
+    assert merged.events == tuple((event,) for event in events)
+
+
+def test_components_whose_arcs_vanish_between_them_switch_together():
+    codes, times = [[2, 2, 0], [0, 2, 0], [0, 0, 0]], torch.tensor([0.5, 0.501], dtype=torch.float64)
+    merged = without_short_arcs(
+        Structure(torch.tensor(codes), times, ((0,), (1,))), torch.tensor([0.0, *times, 1.0]), 0.01
+    )
+    assert merged.arcs.tolist() == [[2, 2, 0], [0, 0, 0]]
+    assert merged.times.tolist() == pytest.approx([0.5005])
+    assert merged.events == ((0, 1),)
 
 
 def test_when_all_are_short_the_longest_stays():
@@ -226,7 +236,7 @@ def test_a_needle_at_an_end_is_one_new_switch():
     assert [structure.arcs.flatten().tolist() for structure in asked] == [[LOWER, UPPER], [UPPER, LOWER]]
     assert asked[0].times.tolist() == pytest.approx([2.97])
     assert asked[1].times.tolist() == pytest.approx([0.03])
-    assert asked[0].events == (0,)
+    assert asked[0].events == ((0,),)
 
 
 def test_a_needle_inside_sits_where_s_is_deepest_and_the_deepest_comes_first():
@@ -237,7 +247,7 @@ def test_a_needle_inside_sits_where_s_is_deepest_and_the_deepest_comes_first():
     assert [structure.arcs.flatten().tolist() for structure in asked] == [[UPPER, LOWER, UPPER]] * 2
     assert asked[0].times.tolist() == pytest.approx([1.97, 2.03], abs=2e-3)
     assert asked[1].times.tolist() == pytest.approx([0.77, 0.83], abs=2e-3)
-    assert asked[0].events == (0, 0)
+    assert asked[0].events == ((0,), (0,))
 
 
 @pytest.mark.parametrize(("depth", "count"), [(-1e-6, 0), (0.0, 0), (1e-6, 1)])
