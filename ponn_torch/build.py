@@ -43,6 +43,7 @@ from ponn_torch.settings import (
     value_of,
 )
 from ponn_torch.solving.continuation import Ladder
+from ponn_torch.solving.guess import STREAMS
 from ponn_torch.solving.solver import Solver
 
 DTYPES = {"float64": torch.float64, "float32": torch.float32}
@@ -238,7 +239,7 @@ def _rehearse(plan: Plan) -> Discretisation:
         _ = disc.expressions
         data = ["data"] if solver.data is not None else []
         check_equations((plan.settings.get("weights") or {}).get("equations", {}), [*equation_names(disc), *data])
-        solver.guess.curve(bvp, 1000 * plan.seed)
+        solver.guess.curve(bvp, STREAMS * plan.seed)
         if solver.data is not None:
             solver.data.of(plan.problem)
     except ValueError as error:

@@ -12,7 +12,7 @@ from ponn_torch.optimal_control.boundary_value_problem import BoundaryValueProbl
 from ponn_torch.optimal_control.problem import OptimalControlProblem
 from ponn_torch.reporting.style import number, unit
 from ponn_torch.solving.feasibility import check_control, check_final_time
-from ponn_torch.solving.guess import Guess, RandomGuess, ScaledCurve
+from ponn_torch.solving.guess import Alternating, Guess, RandomGuess, ScaledCurve
 from ponn_torch.solving.solution import Solution
 from ponn_torch.solving.solver import Solver
 
@@ -53,7 +53,7 @@ def _witness(problem: OptimalControlProblem, solver: Solver, solution: Solution 
     except ImportError:
         return []
     guess: Guess | None = solver.guess
-    if isinstance(guess, RandomGuess):
+    if isinstance(guess, RandomGuess | Alternating):
         guess = None if solution is None else _FromSolution(solution)
     try:
         answer = TwoStage(Unstructured(N_SEGMENTS, guess=guess), n_segments=20).solve(problem)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Protocol
 
@@ -18,6 +18,8 @@ from ponn_torch.optimal_control.discretisation import Strong, discretise
 from ponn_torch.optimal_control.expressions import LinearExpressions
 
 ScaledCurve = Callable[[Tensor], Tensor]  # scaled times (..., m) → w (..., m, 2n)
+
+STREAMS = 1000  # random streams of a seed: start i of seed s takes 1000 s + i
 
 
 def project(collocation: Collocation, curve: ScaledCurve, times: Tensor | None = None) -> Tensor:
@@ -48,6 +50,26 @@ class Guess(Protocol):
     """A first curve for a boundary value problem; ``seed`` chooses among random ones."""
 
     def curve(self, bvp: BoundaryValueProblem, seed: int) -> ScaledCurve: ...
+
+
+@dataclass(frozen=True)
+class Alternating:
+    """Another guess for every start, in turn; one that the problem does not allow is passed over."""
+
+    guesses: Sequence[Guess]
+
+    def __post_init__(self) -> None:
+        if not self.guesses:
+            raise ValueError("guesses: none given; allowed: at least one")
+
+    def curve(self, bvp: BoundaryValueProblem, seed: int) -> ScaledCurve:
+        first, count = seed % STREAMS, len(self.guesses)
+        for i in range(first, first + count - 1):
+            try:
+                return self.guesses[i % count].curve(bvp, seed)
+            except ValueError:
+                continue
+        return self.guesses[(first + count - 1) % count].curve(bvp, seed)
 
 
 # -- random functions ------------------------------------------------------------------------------------------------

@@ -158,10 +158,11 @@ class PolarTransfer:
 
     def curve(self, bvp: BoundaryValueProblem, seed: int) -> ScaledCurve:
         ends = _ends(bvp, self.position, self.velocity)
-        if len(ends.position[0]) != 3:
+        size = len(ends.position[0])
+        if size not in (2, 3):
             raise ValueError(
-                f"guess: state {self.position!r} has {len(ends.position[0])} components in problem "
-                f"{bvp.problem.name!r}; a polar transfer needs 3"
+                f"guess: state {self.position!r} has {size} components in problem {bvp.problem.name!r}; "
+                "a polar transfer needs 2 or 3"
             )
         revolutions = self._several[seed % len(self._several)]
         polar = [_polar(r, v) for r, v in zip(ends.position, ends.velocity, strict=True)]
@@ -180,7 +181,7 @@ class PolarTransfer:
             blend = 3 * s**2 - 2 * s**3
             start, end = s * (1 - s) ** 2 * time, -(s**2) * (1 - s) * time
             rho, angle, height = (values0 + blend * (values1 - values0) + start * rates0 + end * rates1).unbind(-1)
-            return torch.stack([rho * torch.cos(angle), rho * torch.sin(angle), height], -1)
+            return torch.stack([rho * torch.cos(angle), rho * torch.sin(angle), height], -1)[:, :size]
 
         def costates(s: Tensor, needed: Tensor) -> Tensor:
             return -needed / needed.norm(dim=-1).mean()
@@ -189,8 +190,10 @@ class PolarTransfer:
 
 
 def _polar(r: Tensor, v: Tensor) -> tuple[Tensor, Tensor]:
-    """(radius, angle, height) about the z axis and their rates."""
-    rho = torch.hypot(r[0], r[1])
-    values = torch.stack([rho, torch.atan2(r[1], r[0]), r[2]])
-    rates = torch.stack([(r[0] * v[0] + r[1] * v[1]) / rho, (r[0] * v[1] - r[1] * v[0]) / rho**2, v[2]])
+    """(radius, angle, height) about the z axis and their rates; in a plane the height is zero."""
+    rho, (height, climb) = torch.hypot(r[0], r[1]), (r[2], v[2]) if len(r) == 3 else (0 * r[0], 0 * v[0])
+    if not float(rho):
+        raise ValueError("a polar transfer needs ends off the z axis; take a random guess")
+    values = torch.stack([rho, torch.atan2(r[1], r[0]), height])
+    rates = torch.stack([(r[0] * v[0] + r[1] * v[1]) / rho, (r[0] * v[1] - r[1] * v[0]) / rho**2, climb])
     return values, rates

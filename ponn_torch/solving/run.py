@@ -19,7 +19,7 @@ from ponn_torch.optimal_control.problem import OptimalControlProblem
 from ponn_torch.solving import refinement as refinements
 from ponn_torch.solving.budget import Budget
 from ponn_torch.solving.certificate import Certificate, certify
-from ponn_torch.solving.guess import project
+from ponn_torch.solving.guess import STREAMS, project
 from ponn_torch.solving.journal import Journal
 from ponn_torch.solving.observer import Observer
 from ponn_torch.solving.result import SolveResult, StageResult
@@ -78,15 +78,15 @@ class Run:
 
     def result(self) -> SolveResult:
         best: tuple[Solution, Certificate] | None = None
-        guess: Tensor | None = None
+        begun: list[Tensor] = []
         message, verdict, interrupted, n_certified = "", "", False, 0
         try:
             for start in range(self.solver.n_starts):
                 with self.clock:
                     first_stage, xi = self._guessed(start)
-                    if guess is not None and torch.equal(xi, guess):
-                        break
-                    guess = xi if guess is None else guess
+                    if any(torch.equal(xi, other) for other in begun):
+                        continue
+                    begun.append(xi)
                     self.start = start
                     candidate, note = self._one_start(first_stage, xi)
                 message = note or message
@@ -124,11 +124,11 @@ class Run:
     def _guessed(self, start: int) -> tuple[Collocation, Tensor]:
         """The collocation of the first stage, and a start's guess projected on it."""
         like = self.bvp.unit
-        share = torch.linspace(0.0, 1.0, self.solver.n_segments + 1, dtype=like.dtype, device=like.device)
+        share = torch.linspace(0.0, 1.0, self.solver.n_segments_of(start) + 1, dtype=like.dtype, device=like.device)
         collocation = Collocation.on_segments(self.discretisation(None), share * self.bvp.final_time)
         if self.smoothable:
             collocation = collocation.with_setting(smoothing=1.0)
-        return collocation, project(collocation, self.solver.guess.curve(self.bvp, 1000 * self.seed + start))
+        return collocation, project(collocation, self.solver.guess.curve(self.bvp, STREAMS * self.seed + start))
 
     def _one_start(self, collocation: Collocation, xi: Tensor) -> tuple[Solution | None, str]:
         """Everything between a first guess and a trajectory to be judged; None and why where that fails."""

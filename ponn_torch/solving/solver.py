@@ -7,6 +7,7 @@ start that fails is recognised early and the next one is tried; whatever was com
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import torch
@@ -21,9 +22,10 @@ from ponn_torch.optimal_control.measurements import MeasurementFile, Measurement
 from ponn_torch.optimal_control.problem import OptimalControlProblem
 from ponn_torch.solving.certificate import Tolerances
 from ponn_torch.solving.continuation import Ladder, Schedule
-from ponn_torch.solving.guess import Guess, RandomGuess
+from ponn_torch.solving.guess import Alternating, Guess, RandomGuess
 from ponn_torch.solving.journal import Journal
 from ponn_torch.solving.observer import Observer, SilentObserver
+from ponn_torch.solving.paths import PolarTransfer
 from ponn_torch.solving.refinement import Refinement
 from ponn_torch.solving.result import SolveResult
 from ponn_torch.solving.run import Run
@@ -37,16 +39,22 @@ def _default_optimizer() -> Optimizer:
     )
 
 
+def _default_guess() -> Guess:
+    """None is right for all: U(0, 1) suits transfers and landings, N(0, 1) costates that change sign."""
+    return Alternating((RandomGuess(), RandomGuess("normal"), PolarTransfer((0, 1))))
+
+
 @dataclass(frozen=True)
 class Solver:
     """All choices of a solve; every part can be exchanged.
 
     Attributes:
         basis: free function of the smoothed stages: a basis (its size is the number of neurons per chain) or a network.
-        node_kind, n_nodes: collocation points per segment. form: strong or weak residual. n_segments: fixed segments.
+        node_kind, n_nodes: collocation points per segment. form: strong or weak residual.
+        n_segments: fixed segments of the smoothed stages, or of each start's in turn: where one polynomial does not
+            follow the solution, pieces may.
         optimizer, continuation, guess: of the smoothed stages. refinement: None to stop at the smoothed solution.
-        n_starts: starts to try at most; start i of seed s uses the random stream 1000 s + i. They end early where
-            one begins as the first did: a guess with nothing random in it has one start.
+        n_starts: starts to try at most; one that begins as another did is passed over.
         n_certified: stop at this many certified extremals and keep the cheapest; several extremals are real.
         start_limit: ‖r‖ above which a first stage has failed, and at the next smoothing the start; where nothing is
             smoothed and the iteration has settled, it is the ansatz that is too coarse, and the refinement goes on
@@ -64,11 +72,11 @@ class Solver:
     n_nodes: int = 60
     form: Form = field(default_factory=Strong)
     conditioning: str = "columns"
-    n_segments: int = 1
+    n_segments: int | Sequence[int] = (1, 1, 4, 4)
     optimizer: Optimizer = field(default_factory=_default_optimizer)
     continuation: Schedule = field(default_factory=lambda: Ladder((1.0, 0.3, 0.1, 0.03)))
     refinement: Refinement | None = field(default_factory=Split)
-    guess: Guess = field(default_factory=RandomGuess)
+    guess: Guess = field(default_factory=_default_guess)
     n_starts: int = 10
     n_certified: int = 1
     start_limit: float = 0.1
@@ -83,14 +91,24 @@ class Solver:
     device: str = "cpu"
 
     def __post_init__(self) -> None:
-        for name in ("n_nodes", "n_segments", "n_starts", "n_certified"):
+        for name in ("n_nodes", "n_starts", "n_certified"):
             value = getattr(self, name)
             if value < 1:
                 raise ValueError(f"{name} = {value}; allowed: at least 1")
+        if not self._pieces or min(self._pieces) < 1:
+            raise ValueError(f"n_segments = {self.n_segments}; allowed: at least 1, or a list of such numbers")
         if not self.warm_damping >= 0:
             raise ValueError(f"warm_damping = {self.warm_damping}; allowed: a number ≥ 0")
         if not self.cpu_seconds > 0:
             raise ValueError(f"cpu_seconds = {self.cpu_seconds}; allowed: a positive number")
+
+    @property
+    def _pieces(self) -> Sequence[int]:
+        return [self.n_segments] if isinstance(self.n_segments, int) else self.n_segments
+
+    def n_segments_of(self, start: int) -> int:
+        """Fixed segments of a start's smoothed stages."""
+        return self._pieces[start % len(self._pieces)]
 
     @property
     def exact(self) -> bool:
