@@ -42,6 +42,11 @@ class Curve:
         """Scaled w at the knots (K+1, 2n)."""
         return self.unknowns.knots
 
+    @property
+    def residual_norm(self) -> float:
+        """‖r‖."""
+        return float(self.collocation.residual(self.xi).norm())
+
     def segment_of(self, t: Tensor) -> Tensor:
         """Index of the segment that contains each scaled time."""
         interior = self.times[1:-1].contiguous()

@@ -8,9 +8,9 @@ the smoothing behind.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import Enum
-from typing import ClassVar, Protocol
+from typing import ClassVar, Protocol, Self
 
 import torch
 from torch import Tensor
@@ -27,6 +27,8 @@ from ponn_torch.optimal_control.discretisation import Discretisation, Strong, di
 from ponn_torch.solving.guess import project
 
 WORST = 0.01  # of the largest residual between the nodes: segments that are halved first
+
+MORE_NEURONS, MORE_NODES = 6, 8  # per segment, where what is solved is not exact enough to be certified
 
 MakeCallback = Callable[[Collocation], Callback]
 
@@ -64,8 +66,10 @@ class Refined:
 
 
 class Refinement(Protocol):
-    reads_arcs: ClassVar[bool]  # whether the arcs of the curve it starts from matter
-    exact: ClassVar[bool]  # whether what it solves is meant to be certified, or only sharper than before
+    """What makes a solved curve a better one; inherit from it."""
+
+    reads_arcs: ClassVar[bool] = True  # whether the arcs of the curve it starts from matter
+    exact: ClassVar[bool] = True  # whether what it solves is meant to be certified, or only sharper than before
 
     def run(self, start: Curve, callback: MakeCallback | None = None, blunter: Curve | None = None) -> Refined:
         """Refine a curve; never raises for want of convergence, the outcome says how it ended.
@@ -73,6 +77,10 @@ class Refinement(Protocol):
         ``blunter`` is the solution of a larger smoothing, where there is one: the two tell where S goes without any.
         """
         ...
+
+    def finer(self) -> Self | None:
+        """The same at a higher resolution, for what is solved but not exactly enough; None if there is none."""
+        return None
 
 
 @dataclass(frozen=True)
@@ -87,8 +95,6 @@ class Segmentation:
         residual_tolerance: ‖r‖ above which a round has failed.
         off_node_tolerance: largest |ẇ − F| off the nodes, scaled, weighted by the segment's share of the time.
     """
-
-    exact: ClassVar[bool] = True
 
     n_neurons: int = 14
     n_nodes: int = 20
@@ -125,6 +131,12 @@ class Segmentation:
         on_iteration = callback(collocation) if callback else None
         result = optimizer.run(collocation, project(collocation, start), on_iteration)
         return Curve(collocation, result.xi), result
+
+    def finer(self) -> Self | None:
+        """The same with polynomials of higher degree on every segment; None for networks, which have their own size."""
+        if isinstance(self.basis, FreeFunction):
+            return None
+        return replace(self, n_neurons=self.n_neurons + MORE_NEURONS, n_nodes=self.n_nodes + MORE_NODES)
 
     def solved(self, result: OptimizeResult) -> bool:
         return float(result.norm) < self.residual_tolerance
@@ -179,7 +191,7 @@ def shared_out(lengths: Sequence[float], n_segments: int) -> list[int]:
 
 
 @dataclass(frozen=True)
-class Subdivide(Segmentation):
+class Subdivide(Segmentation, Refinement):
     """Solve the curve's own regime on fixed segments, halved until the equations hold between the nodes.
 
     A round that fails is tried again from the last curve that is solved, on more segments.

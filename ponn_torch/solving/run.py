@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -22,12 +23,16 @@ from ponn_torch.solving.certificate import Certificate, certify
 from ponn_torch.solving.guess import STREAMS, project
 from ponn_torch.solving.journal import Journal
 from ponn_torch.solving.observer import Observer
+from ponn_torch.solving.refinement import Refinement
 from ponn_torch.solving.result import SolveResult, StageResult
 from ponn_torch.solving.solution import Solution
 from ponn_torch.solving.walk import Walk
 
 if TYPE_CHECKING:
     from ponn_torch.solving.solver import Solver
+
+SAME = "the same smoothed solution as before"
+MOST_REPEATS = 3  # starts that lead there, after which others are taken to lead there too
 
 
 @dataclass(frozen=True)
@@ -70,7 +75,7 @@ class Run:
         self.stages: list[StageResult] = []
         self.start = 0
         self.refused: list[Tensor] = []  # where smoothed solutions began whose refinement failed
-        self.note = ""
+        self.causes: list[str] = []  # why starts failed, in short
         self.clock, self.journal = Budget(solver.cpu_seconds), journal
         self.measurements = None if solver.data is None else solver.data.of(problem)
 
@@ -82,6 +87,8 @@ class Run:
         message, verdict, interrupted, n_certified = "", "", False, 0
         try:
             for start in range(self.solver.n_starts):
+                if self.causes.count(SAME) >= MOST_REPEATS:
+                    break
                 with self.clock:
                     first_stage, xi = self._guessed(start)
                     if any(torch.equal(xi, other) for other in begun):
@@ -94,7 +101,7 @@ class Run:
                     if self.clock.spent:
                         break
                     continue
-                judged = certify(candidate, self.solver.tolerances)
+                candidate, judged = self._judged(candidate, solved=not note)
                 n_certified += judged.certified
                 if best is None or _better(judged, best[1]):
                     best, message = (candidate, judged), note or judged.verdict
@@ -107,6 +114,9 @@ class Run:
             interrupted, message = True, "interrupted; the best stage so far is kept"
         if best is not None and best[1].certified and not interrupted:
             message = verdict if n_certified == 1 else f"{verdict}; the cheapest of {n_certified} certified starts"
+        if not n_certified and not interrupted and len(self.causes) > 1:
+            tally = ", ".join(f"{count} × {cause}" for cause, count in Counter(self.causes).most_common())
+            message = f"{message}; of {self.start + 1} starts: {tally}"
         spent = self.clock.spent and n_certified < self.solver.n_certified
         if spent and not (best and best[1].certified) and Status.BUDGET.value not in message:
             message = f"{Status.BUDGET.value}: {message}"
@@ -134,15 +144,30 @@ class Run:
         """Everything between a first guess and a trajectory to be judged; None and why where that fails."""
         stages, message = self._continuation(collocation, xi)
         if not stages:
+            self.causes.append("not through the first stages")
             return None, message
-        smoothed = stages[-1]
-        start = smoothed.curve.knots[0]
+        start = stages[-1].curve.knots[0]
         if any(float((start - other).abs().max()) < 1e-5 * float(start.abs().max()) for other in self.refused):
-            return None, f"start {self.start + 1} led to the same smoothed solution as one before: {self.note}"
-        refined, self.note = self._refined(stages)
-        if self.note:
+            self.causes.append(SAME)
+            return None, ""
+        refined, note = self._refined(stages)
+        if note:
             self.refused.append(start)
-        return refined, self.note
+            self.causes.append(note)
+        return refined, note
+
+    def _judged(self, candidate: Solution, *, solved: bool) -> tuple[Solution, Certificate]:
+        """A candidate with its certificate; what is solved, but not exact enough, is solved once more, finer."""
+        judged = certify(candidate, self.solver.tolerances)
+        finer = self.solver.refinement.finer() if solved and self.solver.exact and self.solver.refinement else None
+        if judged.certified or finer is None:
+            return candidate, judged
+        with self.clock:
+            again, note = self._refine(finer, candidate, None)
+        if note:
+            return candidate, judged
+        closer = certify(again, self.solver.tolerances)
+        return (again, closer) if closer.certified else (candidate, judged)
 
     def _last_stage(self) -> Solution | None:
         solutions = [s.solution for s in self.stages if s.solution is not None]
@@ -203,13 +228,27 @@ class Run:
     # -- refinement ---------------------------------------------------------------------------------------------------
 
     def _refined(self, stages: Sequence[Solution]) -> tuple[Solution, str]:
-        """The refined solution where the refinement succeeds or improves, else the smoothed one and why."""
-        refinement, smoothed = self.solver.refinement, stages[-1]
+        """The refined solution where the refinement succeeds or improves, else the smoothed one and why.
+
+        It starts from the sharpest stage, and if that fails from the sharpest that had met its tolerance: a stage that
+        had not may show other arcs.
+        """
+        refinement = self.solver.refinement
         if refinement is None:
-            return smoothed, ""
+            return stages[-1], ""
+        refined, note = self._refine(refinement, stages[-1], self.blunter(stages))
+        solved = [i for i, stage in enumerate(stages) if stage.curve.residual_norm < self.solver.stage_tolerance]
+        if note and refinement.reads_arcs and solved and solved[-1] < len(stages) - 1 and not self.clock.spent:
+            stages = stages[: solved[-1] + 1]
+            again, other = self._refine(refinement, stages[-1], self.blunter(stages))
+            refined, note = (refined, note) if other else (again, "")
+        return refined, note
+
+    def _refine(self, refinement: Refinement, smoothed: Solution, blunter: Curve | None) -> tuple[Solution, str]:
+        """What one refinement makes of a curve, or the curve and why not."""
         name = type(refinement).__name__.lower()
         self.observer.stage_started(name, None, len(self.stages))
-        refined = refinement.run(smoothed.curve, self._callback, self.blunter(stages))
+        refined = refinement.run(smoothed.curve, self._callback, blunter)
         improved = refined.curve is not smoothed.curve
         for result in refined.rounds:
             if not improved or result is not refined.result:

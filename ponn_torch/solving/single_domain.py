@@ -21,7 +21,7 @@ from ponn_torch.optimal_control.discretisation import Discretisation, Form
 from ponn_torch.solving.continuation import Adaptive
 from ponn_torch.solving.continuation import Outcome as Step
 from ponn_torch.solving.guess import project
-from ponn_torch.solving.refinement import MakeCallback, Outcome, Refined
+from ponn_torch.solving.refinement import MakeCallback, Outcome, Refined, Refinement
 from ponn_torch.solving.switching import find_structure, switching_along
 
 
@@ -55,7 +55,7 @@ def find_layers(curve: Curve, smoothing: Tensor | None) -> Layers:
 
 
 @dataclass(frozen=True)
-class SingleDomain(ABC):
+class SingleDomain(Refinement, ABC):
     """Rungs from the smoothing of the curve that is given down to ``last``, the step halved where one fails.
 
     Attributes:
@@ -66,7 +66,6 @@ class SingleDomain(ABC):
         off_node_tolerance: of the last rung, below which it is solved.
     """
 
-    reads_arcs: ClassVar[bool] = True
     exact: ClassVar[bool] = False
 
     last: float = 1e-3

@@ -12,19 +12,18 @@ import math
 from collections import defaultdict
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from typing import ClassVar
 
 import torch
 from torch import Tensor
 
-from ponn_torch.optim.base import OptimizeResult
+from ponn_torch.optim.base import OptimizeResult, Status
 from ponn_torch.optimal_control.boundary_value_problem import Setting
 from ponn_torch.optimal_control.collocation import Collocation
 from ponn_torch.optimal_control.control_laws import Regime
 from ponn_torch.optimal_control.curve import Curve
 from ponn_torch.optimal_control.discretisation import Discretisation
 from ponn_torch.optimal_control.problem import DisplayUnit
-from ponn_torch.solving.refinement import MakeCallback, Outcome, Refined, Segmentation, Segments, shared_out
+from ponn_torch.solving.refinement import MakeCallback, Outcome, Refined, Refinement, Segmentation, Segments, shared_out
 from ponn_torch.solving.sharpening import graded_times, singular_interval, undecided
 from ponn_torch.solving.switching import Structure, claimed_structure, find_structure, needles, without_short_arcs
 
@@ -32,6 +31,7 @@ COLLAPSED = 1e-7  # fraction of the final time, below which an arc is solved awa
 LEGIBLE = 1e-4  # ‖r‖ of a sharpened curve whose arcs are worth reading
 MOVED = 1e-3  # fraction of the final time: arcs are split anew where a sharper curve moves a switch by more
 SAME_SWITCH = 1e-6  # scaled times that differ by less are those of one switch
+SMALLEST_STEP = 0.9  # factor on the smoothing, above which a curve is not sharpened any more
 MORE_SEGMENTS = 4  # multiples of n_segments that are tried where there is no smoothing to lower
 
 
@@ -49,7 +49,7 @@ class _Search:
 
 
 @dataclass(frozen=True)
-class Split(Segmentation):
+class Split(Segmentation, Refinement):
     """Solve between switches until arcs and S agree and the equations hold between the nodes.
 
     Every arc is one or more segments; those that subdivide it sit at fixed fractions between its switches. Where S asks
@@ -65,7 +65,6 @@ class Split(Segmentation):
         max_sharpenings, sharpening: how often, and by which factor, the smoothing is lowered after a failure.
     """
 
-    reads_arcs: ClassVar[bool] = True
     max_arcs: int = 40
     needle: float = 0.01
     short_arc: float = 1e-4
@@ -126,6 +125,8 @@ class Split(Segmentation):
             if result.status.cut or float(result.norm) < LEGIBLE:
                 start, smoothing = curve, sharper
                 yield start, least
+            elif factor > SMALLEST_STEP:
+                return
             else:
                 factor = factor**0.5
 
@@ -168,8 +169,11 @@ class Split(Segmentation):
             legible = float(result.norm) < (0.9 * norm if regime.arcs is None else min(LEGIBLE, 0.1 * norm))
             if not repairs and bool(coarse.any()) and (solved or legible):
                 # also where nothing but the resolution keeps the residual up, as long as that helps
-                halved = Segments(solution.times, segments.events, segments.arcs).halved(coarse)
-                pending.append((solution, halved, float(result.norm)))
+                same = Segments(solution.times, segments.events, segments.arcs)
+                if result.status is Status.MAX_ITERATIONS:  # it was still on its way
+                    pending.append((solution, same, math.inf))
+                else:
+                    pending.append((solution, same.halved(coarse), float(result.norm)))
                 continue
             if solved:
                 tried.append(found)

@@ -9,7 +9,6 @@ for comparison: the arcs are those found at first, and are not repaired.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar
 
 import numpy as np
 import torch
@@ -25,18 +24,17 @@ from ponn_torch.optimal_control.collocation import Collocation
 from ponn_torch.optimal_control.control_laws import Regime
 from ponn_torch.optimal_control.curve import Curve
 from ponn_torch.solving.guess import project
-from ponn_torch.solving.refinement import MakeCallback, Outcome, Refined, Segmentation
+from ponn_torch.solving.refinement import MakeCallback, Outcome, Refined, Refinement, Segmentation
 from ponn_torch.solving.switching import find_structure
 
 
 @dataclass(frozen=True)
-class TwoLoop(Segmentation):
+class TwoLoop(Segmentation, Refinement):
     """One constrained expression per arc; SciPy's ``least_squares`` outside, on switch times and a free final time.
 
     ``n_neurons`` and ``n_nodes`` are per arc, which is never cut. ``max_rounds`` bounds the inner solves.
     """
 
-    reads_arcs: ClassVar[bool] = True
     n_neurons: int = 30
     n_nodes: int = 44
     max_rounds: int = 200
