@@ -113,6 +113,11 @@ def target(name: Any, path: str, rooms: Sequence[str]) -> Callable[..., Any]:
     return public[attribute]
 
 
+def _has(value: Any, name: str, member: Any) -> bool:
+    """Whether a value has what a protocol calls ``name``, a method where that is one."""
+    return callable(getattr(value, name, None)) if callable(member) else hasattr(value, name)
+
+
 def fit(value: Any, hint: Any, path: str) -> Any:
     """The value as the type asks for it (an int becomes a float where one is needed)."""
     origin, options = get_origin(hint), get_args(hint)
@@ -132,7 +137,8 @@ def fit(value: Any, hint: Any, path: str) -> Any:
             return value
     elif origin is not None and issubclass(origin, Sequence):
         if isinstance(value, list | tuple):
-            return [value_of(entry, options[0] if options else Any, f"{path}[{i}]") for i, entry in enumerate(value)]
+            kind = options[0] if options else Any
+            return tuple(value_of(entry, kind, f"{path}[{i}]") for i, entry in enumerate(value))
     elif origin is type:
         if isinstance(value, str):
             value = target(value, path, ROOMS)
@@ -141,7 +147,7 @@ def fit(value: Any, hint: Any, path: str) -> Any:
     elif origin is not None:
         return value
     elif getattr(hint, "_is_protocol", False):
-        if all(callable(getattr(value, name, None)) for name in vars(hint) if not name.startswith("_")):
+        if all(_has(value, name, kind) for name, kind in vars(hint).items() if not name.startswith("_")):
             return value
     elif isinstance(value, hint):
         return value

@@ -55,8 +55,6 @@ def test_defaults_are_those_of_the_solver() -> None:
         given, meant = getattr(solver, item.name), getattr(default, item.name)
         if isinstance(meant, LinearBasis):
             assert (type(given), given.arguments) == (type(meant), meant.arguments)
-        elif item.name == "continuation":
-            assert list(given.values) == list(meant.values)
         else:
             assert given == meant, item.name
 

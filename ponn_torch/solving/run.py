@@ -116,7 +116,7 @@ class Run:
             message = verdict if n_certified == 1 else f"{verdict}; the cheapest of {n_certified} certified starts"
         if not n_certified and not interrupted and len(self.causes) > 1:
             tally = ", ".join(f"{count} × {cause}" for cause, count in Counter(self.causes).most_common())
-            message = f"{message}; of {self.start + 1} starts: {tally}"
+            message = f"{message}; of {len(begun)} starts: {tally}"
         spent = self.clock.spent and n_certified < self.solver.n_certified
         if spent and not (best and best[1].certified) and Status.BUDGET.value not in message:
             message = f"{Status.BUDGET.value}: {message}"
@@ -129,7 +129,7 @@ class Run:
             self.observer.failed(message)
         certificate = best[1] if best else None
         seconds = self.clock.seconds
-        return SolveResult(solution, certificate, self.stages, self.start + 1, message, seconds, interrupted, spent)
+        return SolveResult(solution, certificate, self.stages, max(1, len(begun)), message, seconds, interrupted, spent)
 
     def _guessed(self, start: int) -> tuple[Collocation, Tensor]:
         """The collocation of the first stage, and a start's guess projected on it."""

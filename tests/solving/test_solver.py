@@ -408,7 +408,8 @@ def test_the_message_is_that_of_the_start_which_is_kept(good, count):
 
 @pytest.mark.parametrize(("revolutions", "allowed", "tried"), [(0, 9, 1), ((0, 1), 9, 2), ((0, 1, 2), 2, 2)])
 def test_a_guess_with_nothing_random_in_it_has_as_many_starts_as_it_has_curves(revolutions, allowed, tried):
-    hopeless = Solver(guess=PolarTransfer(revolutions), n_starts=allowed, start_limit=1e-300, continuation=Single())
+    one = Solver(guess=PolarTransfer(revolutions), n_segments=1, n_starts=allowed)
+    hopeless = replace(one, start_limit=1e-300, continuation=Single())
     result = hopeless.solve(problem("earth_mars"))
     assert result.n_starts == tried
     assert {stage.start for stage in result.stages} == set(range(tried))
