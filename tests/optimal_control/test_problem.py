@@ -119,11 +119,12 @@ def test_a_law_without_closed_form_is_refused():
 def test_bounds_must_leave_room():
     made = OptimalControlProblem(
         **statement(
-            control=ThrustBall("force", 1.0, 2.0, size=2),
+            control=ThrustBall("force", "strength", 2.0, size=2),
+            parameters={"strength": 1.0},
             running_cost=lambda t, x, u, p: u.force_magnitude,
         )
     )
-    with pytest.raises(ValueError, match=r"force: minimum = 2.0, maximum = 1.0; 0 ≤ minimum < maximum"):
+    with pytest.raises(ValueError, match=r"force: minimum = 2.0, maximum = strength; 0 ≤ minimum < maximum"):
         pontryagin(made)
 
 
