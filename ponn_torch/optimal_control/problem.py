@@ -201,6 +201,19 @@ class OptimalControlProblem:
         """A copy with other boundary data, final time or known cost (dataclasses.replace)."""
         return replace(self, **changes)
 
+    def scaling_hint(self, largest: float = 1e3) -> str:
+        """The known value farthest above its unit, and the unit to set; empty where all are below ``largest`` units."""
+        values = [("time", "final_time", self.time_guess)]
+        for end in ("initial", "final"):
+            names = [name for name, size in self.states.items() for _ in range(size)]
+            known = zip(names, self.boundary(end), strict=True)
+            values += [(name, f"{end} {name}", abs(value)) for name, value in known if value is not None]
+        name, label, value = max(values, key=lambda entry: entry[2] / self.unit(entry[0]))
+        if value <= largest * self.unit(name):
+            return ""
+        size = f"{label} is {value / self.unit(name):.1e} of its unit, {self.unit(name):g}"
+        return f"{size}; unknowns should be of order one: set units[{name!r}] to about {float(f'{value:.0e}'):g}"
+
     # -- checks ----------------------------------------------------------------------------------------------
 
     def _probe(self) -> None:

@@ -128,6 +128,22 @@ def test_bounds_must_leave_room():
         pontryagin(made)
 
 
+def test_what_is_far_above_its_unit_is_named_with_a_unit_for_it():
+    def hint(**changes: Any) -> str:
+        return OptimalControlProblem(**statement(**changes)).scaling_hint()
+
+    assert hint() == ""
+    far = {"initial": {"position": (0.0, -7.3e6), "velocity": 2e3}}
+    assert hint(**far) == (
+        "initial position is 7.3e+06 of its unit, 1; unknowns should be of order one: set units['position'] to about "
+        "7e+06"
+    )
+    assert hint(**far, units={"position": 1e7, "velocity": 1e3}) == ""
+    assert "initial velocity is 2.0e+03 of its unit, 1" in hint(**far, units={"position": 1e7})
+    assert "final_time is 8.6e+04 of its unit, 1; " in hint(final_time=FreeTime(86400.0))
+    assert hint(final_time=86400.0, units={"time": 86400.0}) == ""
+
+
 def test_boundary_data_are_filled_by_component():
     made = OptimalControlProblem(**statement())
     assert made.boundary("initial") == [0.0, 0.0, 0.0, 0.0]
