@@ -209,7 +209,7 @@ class OptimalControlProblem:
             known = zip(names, self.boundary(end), strict=True)
             values += [(name, f"{end} {name}", abs(value)) for name, value in known if value is not None]
         name, label, value = max(values, key=lambda entry: entry[2] / self.unit(entry[0]))
-        if value <= largest * self.unit(name):
+        if value < largest * self.unit(name):
             return ""
         size = f"{label} is {value / self.unit(name):.1e} of its unit, {self.unit(name):g}"
         return f"{size}; unknowns should be of order one: set units[{name!r}] to about {float(f'{value:.0e}'):g}"

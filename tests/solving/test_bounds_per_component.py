@@ -77,9 +77,7 @@ def test_its_twins_multiply_every_bound():
     assert found.needed / 1.5 == pytest.approx(expected.needed, rel=1e-9)
     one_sided = replace(hurried[0], control=Box("force", (0.8, 1.5), (-0.8, 0.1), 2))
     assert check_control(one_sided, Solver()) is None
-    with pytest.raises(
-        ValueError, match="force from -0.8, 0.1 to 0.8, 1.5; allowed: bounds that include zero"
-    ):
+    with pytest.raises(ValueError, match=r"force from -0.8, 0.1 to 0.8, 1.5; allowed: bounds that include zero"):
         least_control_twin(one_sided)
 
 
