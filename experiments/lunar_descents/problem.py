@@ -33,7 +33,7 @@ def descent(
     return OptimalControlProblem(
         name="lunar_descent",
         states={"r": 3, "v": 3, "m": 1},
-        control=ThrustBall("thrust", weights * MASS * GRAVITY, 0.0, regulariser or Entropy()),
+        control=ThrustBall("thrust", weights * MASS * GRAVITY, 0.0, regulariser=regulariser or Entropy()),
         dynamics=dynamics,
         running_cost=lambda t, x, u, p: u.thrust_magnitude / EXHAUST,
         initial={"r": list(position), "v": list(velocity), "m": MASS},

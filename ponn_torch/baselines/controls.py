@@ -69,11 +69,6 @@ def control_variables(problem: OptimalControlProblem, softening: float) -> Contr
     raise TypeError(f"control set {type(law).__name__}; allowed: ThrustBall, Box, Unconstrained")
 
 
-def _bounds(law: ThrustBall | Box, problem: OptimalControlProblem) -> tuple[float, float]:
-    low, high = law.bounds(Named(**problem.parameters))
-    return float(low), float(high)
-
-
 def _thrust_ball(law: ThrustBall, problem: OptimalControlProblem, softening: float) -> ControlVariables:
     """ν = (|T|, T)/maximum, and the row |T|² − magnitude² − 2 ε magnitude with ε the softening.
 
@@ -82,7 +77,7 @@ def _thrust_ball(law: ThrustBall, problem: OptimalControlProblem, softening: flo
     wherever λv ≠ 0 (lossless convexification), and where an arc pins the magnitude it is put there. At the apex the
     cone has no slope; ε gives it one.
     """
-    low, high = _bounds(law, problem)
+    low, high = map(float, law.bounds(Named(**problem.parameters), problem_units(problem)))
     name, size, least = law.name, law.size, low / high
 
     def limits(lower: float, upper: float) -> Limits:
@@ -111,7 +106,7 @@ def _thrust_ball(law: ThrustBall, problem: OptimalControlProblem, softening: flo
 
 
 def _box(law: Box, problem: OptimalControlProblem) -> ControlVariables:
-    low, high = _bounds(law, problem)
+    low, high = law.bounds(Named(**problem.parameters), problem_units(problem))
     return ControlVariables(
         free=Limits([0.0] * law.size, [1.0] * law.size),
         pinned=lambda codes: Limits([float(c == UPPER) for c in codes], [float(c != LOWER) for c in codes]),

@@ -6,16 +6,16 @@ the arcs. A bounded scalar control is written lower + (upper − lower) η with 
 constant in cost per time. Three regimes:
 
 - smoothed, H affine in η: ``s ρ e(η)`` is added to the running cost, so the minimum principle stays exact at every ρ;
-- H convex in η (``curved``): the minimiser is S/curvature clipped to [0, 1] and needs no smoothing;
+- H a convex parabola in η (``curved``): the minimiser is S/curvature clipped to [0, 1] and needs no smoothing;
 - on an arc: the control is at the bound, or in the interior, that the arc's code names.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from dataclasses import dataclass, field, replace
-from typing import Any, NamedTuple, Protocol, SupportsFloat
+from collections.abc import Callable, Sequence
+from dataclasses import KW_ONLY, dataclass, field, replace
+from typing import Any, ClassVar, NamedTuple, Protocol
 
 import torch
 from torch import Tensor
@@ -65,6 +65,40 @@ def _fraction(at_lower: Tensor, at_upper: Tensor, curved: bool, law: Bounded, re
     return torch.where(regime.arcs == LOWER, zero, torch.where(regime.arcs == UPPER, one, free))
 
 
+# -- probes of H -----------------------------------------------------------------------------------------------------
+
+SHARE = 0.37  # of a range; no symmetry favours it
+ROUNDING = 1e-9  # of a slope
+
+
+def finite(value: Any) -> bool:
+    """Whether a value is one finite number; text and arrays are none."""
+    try:
+        return math.isfinite(value)
+    except (TypeError, ValueError, RuntimeError):  # what is no number; what is several; torch's word for the same
+        return False
+
+
+def _random(like: Tensor, size: int, seed: int = 0) -> Tensor:
+    """The same numbers (..., size) in (−1, 1) every time; ``like`` is (..., 1)."""
+    generator = torch.Generator().manual_seed(seed)
+    return (2.0 * torch.rand(*like.shape[:-1], size, generator=generator, dtype=torch.float64) - 1.0).to(like)
+
+
+def _negligible(difference: Tensor, *slopes: Tensor) -> bool:
+    """Whether a difference of slopes is rounding at all probes; NaN is not."""
+    return bool((difference.abs() <= ROUNDING * sum(x.abs() for x in slopes)).all())
+
+
+def _nowhere_convex(bend: Tensor, *slopes: Tensor) -> bool:
+    """Whether at every state H bends down, by ``bend`` (2k, 1), for a costate or for its opposite.
+
+    Where the state decides, as in m u², which is concave at negative masses only, the certificate will tell.
+    """
+    down = bend < -ROUNDING * sum(x.abs() for x in slopes)
+    return bool(down.view(2, -1).any(0).all())
+
+
 # -- control sets ----------------------------------------------------------------------------------------------------
 
 
@@ -93,7 +127,11 @@ class ControlSet(Protocol):
     def adapted(self, h: Hamiltonian, cost: Hamiltonian, p: Any, one: Tensor, unit: float) -> ControlSet:
         """A copy that knows, from probes of H and of the running cost, whether H is curved and what s is.
 
-        ``unit`` is the scale of H, in cost per time, where the running cost does not tell s.
+        ``h`` and ``cost`` take controls with the batch shape of ``one`` (2k, 1): k points, and these again with the
+        opposite costates. ``unit`` is the scale of H, in cost per time, where the running cost does not tell s.
+
+        Raises:
+            ValueError: H is not of a kind that the set minimises.
         """
         ...
 
@@ -134,40 +172,53 @@ class Unconstrained:
 
     @torch.no_grad()
     def adapted(self, h: Hamiltonian, cost: Hamiltonian, p: Any, one: Tensor, unit: float) -> Unconstrained:
-        # third difference along a generic ray: zero where H is quadratic in u
-        ray = [h(**{self.name: k * self.probe(one)[self.name]}) for k in (0.0, 1.0, 2.0, 3.0)]
-        third = ray[3] - 3 * ray[2] + 3 * ray[1] - ray[0]
-        if bool((third.abs() > 1e-9 * sum(r.abs() for r in ray)).any()):
+        u = _random(one, self.size)
+        back, ahead, far = (self._slope(h, k * u) for k in (-1.0, 1.0, 2.0))
+        if not _negligible(far - 1.5 * ahead + 0.5 * back, back, ahead, far):
             raise ValueError(
-                f"control {self.name!r}: the Hamiltonian is not quadratic in it, so ∂H/∂u = 0 has no closed form"
+                f"control {self.name!r}: the Hamiltonian is not quadratic in it, so ∂H/∂u = 0 has no closed form; "
+                "Stationary solves it over a range"
             )
-        try:
-            self.minimise(h, p, one, Regime())
-        except torch.linalg.LinAlgError:  # type: ignore[attr-defined]
+        at_zero, hessian = self._parabola(h, one)
+        curvature = torch.linalg.eigvalsh(hessian)
+        rounding = torch.maximum(ROUNDING * curvature[..., -1].abs(), 1e-13 * at_zero.abs().amax(-1))
+        if not bool((curvature[..., 0] > rounding).any()):
+            if bool((curvature[..., 0] < -rounding).any()):
+                raise ValueError(
+                    f"control {self.name!r}: H_uu is positive definite at none of the probes, so ∂H/∂u = 0 does not "
+                    "minimise H"
+                )
             raise ValueError(
                 f"control {self.name!r}: H_uu is singular, so ∂H/∂u = 0 does not determine it; "
                 "where H is linear in a control, it needs bounds (Box, ThrustBall)"
-            ) from None
+            )
         return self
 
     def minimise(self, h: Hamiltonian, p: Any, like: Tensor, regime: Regime) -> Minimiser:
-        def gradient(u: Tensor) -> Tensor:
-            return gradients(lambda u: h(**{self.name: u}), u)[0]
-
-        zero = torch.zeros_like(like).expand(*like.shape[:-1], self.size).contiguous()
-        at_zero = gradient(zero)
-        units = torch.eye(self.size, dtype=like.dtype, device=like.device)
-        # H is quadratic, so a unit step in the gradient is a column of H_uu
-        hessian = torch.stack([gradient(zero + unit) - at_zero for unit in units], -1)
+        at_zero, hessian = self._parabola(h, like)
         u = -torch.linalg.solve(hessian, at_zero.unsqueeze(-1)).squeeze(-1)
         none = like[..., :0]
         return Minimiser({self.name: u}, none, none)
+
+    def _slope(self, h: Hamiltonian, u: Tensor) -> Tensor:
+        return gradients(lambda u: h(**{self.name: u}), u)[0]
+
+    def _parabola(self, h: Hamiltonian, like: Tensor) -> tuple[Tensor, Tensor]:
+        """H_u (..., m) where u = 0, and H_uu (..., m, m)."""
+        zero = torch.zeros_like(like).expand(*like.shape[:-1], self.size).contiguous()
+        at_zero = self._slope(h, zero)
+        units = torch.eye(self.size, dtype=like.dtype, device=like.device)
+        # H is quadratic, so a unit step in the gradient is a column of H_uu
+        return at_zero, torch.stack([self._slope(h, zero + unit) - at_zero for unit in units], -1)
 
     def penalty(self, minimiser: Minimiser, p: Any, smoothing: Tensor) -> Tensor:
         return torch.zeros_like(smoothing)
 
     def arc_codes(self, switching: Tensor) -> Tensor:
         return torch.zeros_like(switching, dtype=torch.long)
+
+
+Bound = float | str | Sequence[float]
 
 
 @dataclass(frozen=True)
@@ -179,23 +230,57 @@ class Bounded:
     """
 
     name: str
-    maximum: float | str
-    minimum: float | str = 0.0
+    maximum: Bound
+    minimum: Bound = 0.0
+    size: int = 1
+    _: KW_ONLY
     regulariser: Regulariser = field(default_factory=Entropy)
     switching_level: float = 0.0
-    cost_rate: float | None = None
+    cost_rate: float | tuple[float, ...] | None = None
     curved: bool = False
 
+    least: ClassVar[float] = -math.inf
+    allowed: ClassVar[str] = "a finite number, or the name of a parameter"
+    room: ClassVar[str] = "minimum < maximum"
+
     def __post_init__(self) -> None:
+        if not (isinstance(self.size, int) and self.size > 0):
+            raise ValueError(f"{self.name}: size = {self.size!r}; allowed: a whole number from 1")
+        if isinstance(self.regulariser, type) or not isinstance(self.regulariser, Regulariser):
+            allowed = "Entropy(), Quadratic(), Logarithmic(), or what has their methods"
+            raise ValueError(f"{self.name}: regulariser = {self.regulariser!r}; allowed: {allowed}")
         for label in ("minimum", "maximum"):
             bound = getattr(self, label)
-            if not (isinstance(bound, str) or (isinstance(bound, SupportsFloat) and math.isfinite(bound))):
-                allowed = "a finite number, the same for all components, or the name of a parameter"
-                raise ValueError(f"{self.name}: {label} = {bound!r}; allowed: {allowed}")
+            if not (isinstance(bound, str) or finite(bound) or self._per_component(bound)):
+                raise ValueError(f"{self.name}: {label} = {bound!r}; allowed: {self.allowed}")
+        if not (isinstance(self.minimum, str) or isinstance(self.maximum, str)):
+            self._check_room(*self.bounds(None, torch.zeros((), dtype=torch.float64)))
 
-    def bounds(self, p: Any) -> tuple[Any, Any]:
-        low, high = (getattr(p, b) if isinstance(b, str) else b for b in (self.minimum, self.maximum))
-        return low, high
+    def _per_component(self, bound: Any) -> bool:
+        """Whether a bound is a sequence of numbers, one per component, and sequences are allowed."""
+        return False
+
+    def _check_room(self, low: Any, high: Any) -> None:
+        low, high = torch.as_tensor(low), torch.as_tensor(high)
+        if not bool(((low >= self.least) & (low < high)).all()):
+            raise ValueError(f"{self.name}: minimum = {self.minimum}, maximum = {self.maximum}; {self.room}")
+
+    def bounds(self, p: Any, like: Tensor) -> tuple[Any, Any]:
+        """Minimum and maximum: numbers, parameters of ``p``, or (size,) as ``like`` is where components differ."""
+
+        def value(bound: Bound) -> Any:
+            if isinstance(bound, str):
+                return getattr(p, bound)
+            return like.new_tensor(bound) if isinstance(bound, Sequence) else bound
+
+        return value(self.minimum), value(self.maximum)
+
+    def _inside(self, one: Tensor) -> Tensor:
+        """A value between bounds that are numbers; one where they are parameters."""
+        if isinstance(self.minimum, str) or isinstance(self.maximum, str):
+            return one
+        low, high = self.bounds(None, one)
+        return one * (low + SHARE * (high - low))
 
     def arc_codes(self, switching: Tensor) -> Tensor:
         if not self.curved:
@@ -206,16 +291,19 @@ class Bounded:
     def penalty(self, minimiser: Minimiser, p: Any, smoothing: Tensor) -> Tensor:
         if self.curved:
             return torch.zeros_like(smoothing)
-        low, high = self.bounds(p)
+        low, high = self.bounds(p, smoothing)
         eta = minimiser.fraction
         reward = smoothing * self.regulariser.penalty(eta) + self.switching_level * eta
-        return (self.cost_rate * (high - low) * reward).sum(-1, keepdim=True)
+        return (self._rate(smoothing) * (high - low) * reward).sum(-1, keepdim=True)
+
+    def _rate(self, like: Tensor) -> Any:
+        if self.cost_rate is None:
+            raise ValueError(f"{self.name}: cost_rate = None; allowed: a number (`adapted` finds one)")
+        return like.new_tensor(self.cost_rate) if isinstance(self.cost_rate, tuple) else self.cost_rate
 
     def _scaled(self, gain: Tensor) -> Tensor:
         """S from a decrease of H per unit of control."""
-        if self.cost_rate is None:
-            raise ValueError(f"{self.name}: cost_rate = None; allowed: a number (`adapted` finds one)")
-        return gain / self.cost_rate
+        return gain / self._rate(gain)
 
     def _switching(self, at_lower: Tensor, at_upper: Tensor) -> Tensor:
         return torch.cat([at_lower, at_upper], -1) if self.curved else at_lower
@@ -228,10 +316,14 @@ class ThrustBall(Bounded):
 
     The two enter the Hamiltonian as independent arguments, H linear in the vector, so that no norm is differentiated:
     the direction is −primer/|primer| with primer = ∂H/∂vector, and S = (|primer| − ∂H/∂magnitude)/cost_rate
-    (PoNN paper eq. 36–38).
+    (PoNN paper eq. 36–38). With size=1 it is a force of either sign whose magnitude is paid for; one that cannot turn
+    round is a Box.
     """
 
     size: int = 3
+
+    least: ClassVar[float] = 0.0
+    room: ClassVar[str] = "0 ≤ minimum < maximum"
 
     @property
     def names(self) -> dict[str, int]:
@@ -245,41 +337,51 @@ class ThrustBall(Bounded):
         return {self.name: vector, f"{self.name}_magnitude": magnitude}
 
     def probe(self, one: Tensor) -> dict[str, Tensor]:
-        return self._controls(one.expand(*one.shape[:-1], self.size) / self.size**0.5, one)
+        magnitude = self._inside(one)
+        return self._controls(magnitude.expand(*one.shape[:-1], self.size) / self.size**0.5, magnitude)
+
+    def _slopes(self, h: Hamiltonian, vector: Tensor, magnitude: Tensor) -> tuple[Tensor, ...]:
+        """The primer ∂H/∂vector (..., size) and ∂H/∂magnitude (..., 1)."""
+        return gradients(lambda vector, magnitude: h(**self._controls(vector, magnitude)), vector, magnitude)
 
     @torch.no_grad()
     def adapted(self, h: Hamiltonian, cost: Hamiltonian, p: Any, one: Tensor, unit: float) -> ThrustBall:
-        low, high = (torch.as_tensor(b, dtype=one.dtype) for b in self.bounds(p))
-        if not bool(((low >= 0) & (low < high)).all()):
-            raise ValueError(f"{self.name}: minimum = {self.minimum}, maximum = {self.maximum}; 0 ≤ minimum < maximum")
+        low, high = (torch.as_tensor(b, dtype=one.dtype) for b in self.bounds(p, one))
+        self._check_room(low, high)
         zero = torch.zeros_like(one)
         vector = zero.expand(*one.shape[:-1], self.size)
-        at = [h(**self._controls(vector, zero + k * high)) for k in (0.0, 0.5, 1.0)]
-        size = (at[2] - at[0]).abs() + 1e-4 * sum(a.abs() for a in at)
-        bend = at[2] - 2 * at[1] + at[0]
-        curved = bool((bend.abs() > 1e-9 * size).any())
-        if bool((bend < -1e-9 * size).any()):
+        probes = [
+            self._slopes(h, high * _random(one, self.size, seed), zero + low + share * (high - low))
+            for seed, share in enumerate((0.0, SHARE, 1.0))
+        ]
+        if not all(_negligible(primer - probes[0][0], primer) for primer, _ in probes):
+            raise ValueError(
+                f"{self.name}: the Hamiltonian is not linear in the vector u.{self.name}; "
+                f"write its norm as u.{self.name}_magnitude, and multiply no vector with a magnitude"
+            )
+        first, third, last = (slope for _, slope in probes)
+        bend = last - first
+        if not _negligible(third - first - SHARE * bend, first, third, last):
+            raise ValueError(f"{self.name}: the Hamiltonian is neither affine nor quadratic in its magnitude")
+        if _nowhere_convex(bend, first, last):
             raise ValueError(f"{self.name}: the Hamiltonian is concave in its magnitude; allowed: affine or convex")
+        curved = not _negligible(bend, first, last)
         slope = ((cost(**self._controls(vector, zero + high)) - cost(**self._controls(vector, zero))) / high).flatten()
         constant = float(slope.min()) > 0 and float(slope.max() - slope.min()) <= 1e-9 * float(slope.max())
         rate = self.cost_rate or (float(slope[0]) if constant else unit / float(high.max()))
         return replace(self, curved=curved, cost_rate=rate)
 
     def minimise(self, h: Hamiltonian, p: Any, like: Tensor, regime: Regime) -> Minimiser:
-        low, high = self.bounds(p)
-
-        def slopes(vector: Tensor, magnitude: Tensor) -> tuple[Tensor, ...]:
-            return gradients(lambda vector, magnitude: h(**self._controls(vector, magnitude)), vector, magnitude)
-
+        low, high = self.bounds(p, like)
         zero = torch.zeros_like(like)
         vector = zero.expand(*like.shape[:-1], self.size)
-        primer, slope = slopes(vector, zero + low)
+        primer, slope = self._slopes(h, vector, zero + low)
         square = (primer * primer).sum(-1, keepdim=True)
         some = square > 0  # where the primer vanishes no direction is better than another, and none is taken
         inverse = torch.rsqrt(torch.where(some, square, 1.0))
         norm = square * inverse
         at_lower = self._scaled(norm - slope)
-        at_upper = self._scaled(norm - slopes(vector, zero + high)[1]) if self.curved else at_lower
+        at_upper = self._scaled(norm - self._slopes(h, vector, zero + high)[1]) if self.curved else at_lower
         fraction = _fraction(at_lower, at_upper, self.curved, self, regime)
         magnitude = low + (high - low) * fraction
         control = self._controls(-(magnitude * inverse) * primer, magnitude)
@@ -288,9 +390,23 @@ class ThrustBall(Bounded):
 
 @dataclass(frozen=True)
 class Box(Bounded):
-    """Components with minimum ≤ u_i ≤ maximum, each entering H apart from the others, all affine or all convex."""
+    """Components with minimum ≤ u_i ≤ maximum, each entering H apart from the others, all affine or all convex.
 
-    size: int = 1
+    A bound may also be a sequence of numbers, one per component. Convex means quadratic; where H is anything else, or
+    convex for some costates and concave for others, ``Stationary`` finds minima inside the range.
+    """
+
+    allowed: ClassVar[str] = "a finite number, one for every component, or the name of a parameter"
+
+    def __post_init__(self) -> None:
+        for label in ("minimum", "maximum"):
+            bound = getattr(self, label)
+            if isinstance(bound, Sequence) and not isinstance(bound, str):
+                object.__setattr__(self, label, tuple(bound))
+        super().__post_init__()
+
+    def _per_component(self, bound: Any) -> bool:
+        return isinstance(bound, tuple) and len(bound) == self.size and all(map(finite, bound))
 
     @property
     def names(self) -> dict[str, int]:
@@ -301,48 +417,52 @@ class Box(Bounded):
         return (2 if self.curved else 1) * self.size
 
     def probe(self, one: Tensor) -> dict[str, Tensor]:
-        return {self.name: one.expand(*one.shape[:-1], self.size)}
+        return {self.name: self._inside(one).expand(*one.shape[:-1], self.size)}
+
+    def _slope(self, h: Hamiltonian, u: Tensor) -> Tensor:
+        return gradients(lambda u: h(**{self.name: u}), u)[0]
 
     @torch.no_grad()
     def adapted(self, h: Hamiltonian, cost: Hamiltonian, p: Any, one: Tensor, unit: float) -> Box:
-        low, high = (torch.as_tensor(b, dtype=one.dtype) for b in self.bounds(p))
-        if not bool((low < high).all()):
-            raise ValueError(f"{self.name}: minimum = {self.minimum}, maximum = {self.maximum}; minimum < maximum")
-
-        def gradient(u: Tensor) -> Tensor:
-            return gradients(lambda u: h(**{self.name: u}), u)[0]
-
-        zero = torch.zeros_like(one).expand(*one.shape[:-1], self.size).contiguous()
-        base, changes, scale = gradient(zero + low), [], 0.0
+        low, high = (torch.as_tensor(b, dtype=one.dtype) for b in self.bounds(p, one))
+        self._check_room(low, high)
+        span = (high - low).expand(*one.shape[:-1], self.size)
+        start, curved = 0.5 + 0.5 * _random(one, self.size), []
         for i in range(self.size):
-            step = zero.clone()
-            step[..., i] = (high - low).flatten()[0]
-            difference = gradient(zero + low + step) - base
-            scale = max(scale, float(difference.abs().max()), 1e-12 * float(base.abs().max()))
-            changes.append(float(difference[..., i].abs().max()))
-            if float(difference[..., i].min()) < -1e-9 * float(base.abs().max()):
-                raise ValueError(f"{self.name}: the Hamiltonian is concave in component {i}; allowed: affine or convex")
-            difference[..., i] = 0.0
-            if float(difference.abs().max()) > 1e-9 * scale:
+            slopes = []
+            for share in (0.0, SHARE, 1.0):
+                eta = start.clone()
+                eta[..., i] = share
+                slopes.append(span * self._slope(h, low + span * eta))
+            others = [k for k in range(self.size) if k != i]
+            if not _negligible((slopes[2] - slopes[0])[..., others], *(slope[..., others] for slope in slopes)):
                 raise ValueError(f"{self.name}: the Hamiltonian couples its components; a box needs a separable H")
-        convex = [change > 1e-9 * float(base.abs().max()) for change in changes]
-        curved = any(convex)
-        if curved and not all(convex):
+            first, third, last = (slope[..., [i]] for slope in slopes)
+            bend = last - first
+            if not _negligible(third - first - SHARE * bend, first, third, last):
+                raise ValueError(
+                    f"{self.name}: the Hamiltonian is neither affine nor quadratic in component {i}; a smooth one "
+                    "needs Stationary over the same range, a kink as in |u| a ThrustBall or two non-negative parts of u"
+                )
+            if _nowhere_convex(bend, first, last):
+                raise ValueError(
+                    f"{self.name}: the Hamiltonian is concave in component {i}; allowed: affine or convex, whatever "
+                    "the signs of the costates; Stationary over the same range takes the lowest H, wherever it is"
+                )
+            curved.append(not _negligible(bend, first, last))
+        if len(set(curved)) > 1:
             raise ValueError(
-                f"{self.name}: the Hamiltonian is affine in component {convex.index(False)} and curved in component "
-                f"{convex.index(True)}; a box needs all of one kind"
+                f"{self.name}: the Hamiltonian is affine in component {curved.index(False)} and curved in component "
+                f"{curved.index(True)}; a box needs all of one kind"
             )
-        rate = self.cost_rate or unit / float((high - low).max())
-        return replace(self, curved=curved, cost_rate=rate)
+        rates = tuple(unit / width for width in span.amax(0).tolist())
+        rate = self.cost_rate or (rates[0] if len(set(rates)) == 1 else rates)
+        return replace(self, curved=curved[0], cost_rate=rate)
 
     def minimise(self, h: Hamiltonian, p: Any, like: Tensor, regime: Regime) -> Minimiser:
-        low, high = self.bounds(p)
-
-        def gradient(u: Tensor) -> Tensor:
-            return gradients(lambda u: h(**{self.name: u}), u)[0]
-
+        low, high = self.bounds(p, like)
         zero = torch.zeros_like(like).expand(*like.shape[:-1], self.size)
-        at_lower = self._scaled(-gradient(zero + low))
-        at_upper = self._scaled(-gradient(zero + high)) if self.curved else at_lower
+        at_lower = self._scaled(-self._slope(h, zero + low))
+        at_upper = self._scaled(-self._slope(h, zero + high)) if self.curved else at_lower
         fraction = _fraction(at_lower, at_upper, self.curved, self, regime)
         return Minimiser({self.name: low + (high - low) * fraction}, self._switching(at_lower, at_upper), fraction)

@@ -14,6 +14,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from ponn_torch.numerics.autodiff import gradients_and_values
 from ponn_torch.optimal_control.boundary_value_problem import BoundaryValueProblem, Chain, Setting
 from ponn_torch.optimal_control.control_laws import INTERIOR, LOWER, UPPER, ControlSet, Regime
 from ponn_torch.optimal_control.meaning import Keyed, meaning
@@ -133,11 +134,45 @@ def _n_multipliers(bvp: BoundaryValueProblem) -> int:
 
 
 def probe_points(bvp: BoundaryValueProblem, count: int, seed: int = 0) -> tuple[Tensor, Tensor]:
-    """Random (t, w) of order one for structural probes, away from zeros."""
+    """Random (t, w) for structural probes, where the equations are finite: at most ``count``, away from zeros.
+
+    Costates have either sign. States have either sign and varied size at every second point; at the others they are
+    positive and of order one, as radii and densities are everywhere. A mass is always positive.
+
+    Raises:
+        ValueError: the equations are finite at none of them.
+    """
     generator = torch.Generator().manual_seed(seed)
-    values = 0.5 + torch.rand(count, 1 + bvp.dimension, generator=generator, dtype=torch.float64)
-    values = values.to(bvp.unit)
-    return values[:, :1], values[:, 1:]
+    share, coin = torch.rand(2, count, 1 + bvp.dimension, generator=generator, dtype=torch.float64).to(bvp.unit)
+    varied = torch.arange(count, device=coin.device)[:, None] % 2 == 1
+    size = torch.where(varied, 2.0 ** (5.0 * share - 3.0), 0.5 + share)
+    may_turn = torch.ones_like(coin, dtype=torch.bool)
+    may_turn[:, : 1 + bvp.n_states] = varied
+    may_turn[:, 0] = False  # time
+    if bvp.problem.mass is not None and bvp.mass_variable == "mass":
+        may_turn[:, 1 + bvp.problem.slices[bvp.problem.mass].start] = False
+    values = torch.where(may_turn & (coin < 0.5), -size, size)
+    t, w = values[:, :1], values[:, 1:]
+    finite = _finite(bvp, t, w)
+    if not bool(finite.any()):
+        raise ValueError(
+            f"{bvp.problem.name}: the equations are finite at none of the points where they were probed, times and "
+            "states of the order of their units; set units to the sizes that they have"
+        )
+    return t[finite], w[finite]
+
+
+def _finite(bvp: BoundaryValueProblem, t: Tensor, w: Tensor) -> Tensor:
+    """Where H, its rates and its slopes are finite (count,), at a control of the set."""
+    x, costates = bvp.to_physical(w)
+    u, p = Named(**bvp.law.probe(torch.ones_like(t))), Named(**_parameters(bvp, t))
+
+    def h(x: Tensor) -> tuple[Tensor, tuple[Tensor, Tensor]]:
+        value, rates = bvp._hamiltonian(t * bvp.time_unit, x, costates, u, p)
+        return value, (value, rates)
+
+    (slopes,), values = gradients_and_values(h, x)
+    return torch.cat([slopes, *values], -1).isfinite().all(-1)
 
 
 def _parameters(bvp: BoundaryValueProblem, like: Tensor) -> dict[str, Tensor]:
@@ -164,8 +199,10 @@ def probe_settings(bvp: BoundaryValueProblem, t: Tensor) -> list[Setting]:
 
 
 def _adapted_law(bvp: BoundaryValueProblem) -> ControlSet:
-    t, w = probe_points(bvp, 8)
-    x, costates = bvp.to_physical(w)
+    """The law, told about H at probes and at these again with the opposite costates."""
+    t, w = probe_points(bvp, 32)
+    t, (x, costates) = t.repeat(2, 1), bvp.to_physical(w.repeat(2, 1))
+    costates = torch.cat([costates[: len(w)], -costates[len(w) :]])
     p = Named(**_parameters(bvp, t))
 
     def cost(**u: Tensor) -> Tensor:
@@ -174,12 +211,12 @@ def _adapted_law(bvp: BoundaryValueProblem) -> ControlSet:
     def h(**u: Tensor) -> Tensor:
         return bvp._hamiltonian(t * bvp.time_unit, x, costates, Named(**u), p)[0]
 
-    return bvp.law.adapted(h, cost, p, t, bvp.cost_unit / bvp.time_unit)
+    return bvp.law.adapted(h, cost, p, torch.ones_like(t), bvp.cost_unit / bvp.time_unit)
 
 
 def _couplings(bvp: BoundaryValueProblem) -> Tensor:
     """Boolean (2n, 2n): F_i depends on w_j, found at random points."""
-    t, w = probe_points(bvp, 16, seed=1)
+    t, w = probe_points(bvp, 32, seed=1)
     rows = range(bvp.dimension)
     slopes = [bvp.linearised_rates(t, w, setting, rows)[2] for setting in probe_settings(bvp, t)]
     return (torch.stack(slopes) != 0).any(0).any(0)  # NaN counts: nothing says that it does not depend
@@ -189,7 +226,7 @@ def _single_chains(bvp: BoundaryValueProblem) -> tuple[Chain, ...]:
     return tuple(Chain((i,), (1.0,)) for i in range(bvp.dimension))
 
 
-def find_chains(bvp: BoundaryValueProblem, n_probes: int = 32) -> tuple[Chain, ...]:
+def find_chains(bvp: BoundaryValueProblem, n_probes: int = 64) -> tuple[Chain, ...]:
     """Find F_i ≡ k w_j by evaluating F at random points, join them, and mark chains whose last rate is zero.
 
     A chain has to hold in every setting: for all values of the parameters, and on every arc.
@@ -198,16 +235,15 @@ def find_chains(bvp: BoundaryValueProblem, n_probes: int = 32) -> tuple[Chain, .
     settings = probe_settings(bvp, t)
     rates = torch.cat([bvp.rates(t, w, setting) for setting in settings])
     w = w.repeat(len(settings), 1)
-    scale = rates.abs().amax().clamp_min(1.0)
     follows: dict[int, tuple[int, float]] = {}
     for i in range(bvp.dimension):
         for j in range(bvp.dimension):
             ratio = rates[:, i] / w[:, j]
-            k = float(ratio.mean())
-            if i != j and abs(k) > 1e-12 and float((rates[:, i] - k * w[:, j]).abs().max()) < 1e-12 * abs(k):
+            k = float(f"{ratio.mean():.15g}")  # the digits that do not depend on the probes
+            if i != j and abs(k) > 1e-12 and bool(((ratio - k).abs() < 1e-12 * abs(k)).all()):
                 follows[i] = (j, k)
     taken = {j for j, _ in follows.values()}
-    zero = rates.abs().amax(0) < 1e-14 * scale
+    zero = (rates.abs() < 1e-14 * rates.abs().amax(-1, keepdim=True).clamp_min(1.0)).all(0)
     out, used = [], set()
     # a chain starts where nothing leads to it; what remains after that can only be a cycle (ẋ = λ, λ̇ = x), cut anywhere
     for i in [*(i for i in range(bvp.dimension) if i not in taken), *range(bvp.dimension)]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from difflib import get_close_matches
@@ -12,7 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ponn_torch.optimal_control.control_laws import Bounded, ControlSet
+from ponn_torch.optimal_control.control_laws import Bounded, ControlSet, finite
 
 StateValues = Mapping[str, float | Sequence[float | None] | None]
 
@@ -29,14 +28,6 @@ def nearest(name: str, allowed: Mapping[str, Any] | Sequence[str]) -> str:
     close = get_close_matches(name, list(allowed), n=1)
     hint = f" (did you mean {close[0]!r}?)" if close else ""
     return f"allowed: {', '.join(allowed)}{hint}"
-
-
-def _finite(value: Any) -> bool:
-    """Whether a value is one finite number; text and arrays are none."""
-    try:
-        return math.isfinite(value)
-    except (TypeError, ValueError, RuntimeError):  # what is no number; what is several; torch's word for the same
-        return False
 
 
 @dataclass(frozen=True)
@@ -121,10 +112,10 @@ class OptimalControlProblem:
                     raise ValueError(f"{self.name}: {label} names {name!r}; {nearest(name, allowed)}")
         for label, mapping in (("units", self.units), ("costate_units", self.costate_units)):
             for name, value in mapping.items():
-                if not (_finite(value) and value > 0):
+                if not (finite(value) and value > 0):
                     raise ValueError(f"{self.name}: {label}[{name!r}] = {value!r}; a positive number is needed")
         guess = self.final_time.guess if isinstance(self.final_time, FreeTime) else self.final_time
-        if not (_finite(guess) and guess > 0):
+        if not (finite(guess) and guess > 0):
             raise ValueError(f"{self.name}: final_time = {guess!r} s; a positive number is needed")
         if self.running_cost is None and self.terminal_cost is None:
             raise ValueError(f"{self.name}: running_cost and terminal_cost are both missing; nothing to minimise")
@@ -133,7 +124,7 @@ class OptimalControlProblem:
         for label in ("initial", "final"):
             self.boundary(label)
         for name, value in self.parameters.items():
-            if not _finite(value):
+            if not finite(value):
                 raise ValueError(f"{self.name}: parameters[{name!r}] = {value!r}; a finite number is needed")
         bounded = self.control if isinstance(self.control, Bounded) else None
         for label in ("minimum", "maximum") if bounded is not None else ():
@@ -201,7 +192,7 @@ class OptimalControlProblem:
             if len(entries) != size:
                 raise ValueError(f"{self.name}: {end}[{name!r}] has {len(entries)} entries; {size} are needed")
             for entry in entries:
-                if entry is not None and not _finite(entry):
+                if entry is not None and not finite(entry):
                     raise ValueError(f"{self.name}: {end}[{name!r}] = {value!r}; finite numbers or None are needed")
             out += [None if entry is None else float(entry) for entry in entries]
         return out
@@ -209,6 +200,19 @@ class OptimalControlProblem:
     def with_boundary(self, **changes: Any) -> OptimalControlProblem:
         """A copy with other boundary data, final time or known cost (dataclasses.replace)."""
         return replace(self, **changes)
+
+    def scaling_hint(self, largest: float = 1e3) -> str:
+        """The known value farthest above its unit, and the unit to set; empty where all are below ``largest`` units."""
+        values = [("time", "final_time", self.time_guess)]
+        for end in ("initial", "final"):
+            names = [name for name, size in self.states.items() for _ in range(size)]
+            known = zip(names, self.boundary(end), strict=True)
+            values += [(name, f"{end} {name}", abs(value)) for name, value in known if value is not None]
+        name, label, value = max(values, key=lambda entry: entry[2] / self.unit(entry[0]))
+        if value < largest * self.unit(name):
+            return ""
+        size = f"{label} is {value / self.unit(name):.1e} of its unit, {self.unit(name):g}"
+        return f"{size}; unknowns should be of order one: set units[{name!r}] to about {float(f'{value:.0e}'):g}"
 
     # -- checks ----------------------------------------------------------------------------------------------
 

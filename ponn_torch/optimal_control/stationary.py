@@ -82,7 +82,7 @@ class Stationary:
         if not bool(inside.any()):
             raise ValueError(
                 f"control {self.name!r}: the Hamiltonian has no stationary point between {self.minimum:g} and "
-                f"{self.maximum:g}; a control that sits at its bounds needs a Box"
+                f"{self.maximum:g}; a control that always sits at its bounds needs a Box, and H affine in it"
             )
         if not bool((inside & convex).any()):
             raise ValueError(

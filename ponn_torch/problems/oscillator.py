@@ -42,7 +42,7 @@ def oscillator(
         name=name,
         description="Harmonic oscillator with two bounded inputs, minimum time",
         states={"z": 2},
-        control=Box("force", bound, -bound, make_regulariser(regulariser), size=2),
+        control=Box("force", bound, -bound, regulariser=make_regulariser(regulariser), size=2),
         dynamics=dynamics,
         running_cost=lambda t, x, u, p: torch.ones_like(x.z[..., :1]),
         initial={"z": list(initial_state)},

@@ -88,7 +88,12 @@ def small_body_landing(
         description="Small-body landing in a rotating frame, minimum fuel",
         states={"r": 3, "v": 3, "m": 1},
         control=ThrustBall(
-            "thrust", maximum_thrust, minimum_thrust, make_regulariser(regulariser), switching_level, size=3
+            "thrust",
+            maximum_thrust,
+            minimum_thrust,
+            size=3,
+            regulariser=make_regulariser(regulariser),
+            switching_level=switching_level,
         ),
         dynamics=dynamics,
         running_cost=lambda t, x, u, p: alpha * u.thrust_magnitude,

@@ -14,7 +14,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from ponn_torch.optimal_control.problem import DisplayUnit
+from ponn_torch.optimal_control.control_laws import Bounded
+from ponn_torch.optimal_control.problem import DisplayUnit, Named
 from ponn_torch.reporting.diagnostics import convergence_figure, hamiltonian_figure, residual_figure
 from ponn_torch.reporting.style import (
     ARCS,
@@ -81,9 +82,11 @@ def costates_figure(solution: Solution) -> Figure:
 
 def _bounds(solution: Solution) -> tuple[float, ...]:
     """Numerical bounds of the control set, in SI; () where it has none."""
-    law, values = solution.problem.control, solution.problem.parameters
-    found = (getattr(law, side, None) for side in ("minimum", "maximum"))
-    return tuple(float(values[b] if isinstance(b, str) else b) for b in found if b is not None)
+    law, double = solution.problem.control, torch.zeros((), dtype=torch.float64)
+    if not isinstance(law, Bounded):
+        return tuple(float(getattr(law, side)) for side in ("minimum", "maximum") if hasattr(law, side))
+    found = law.bounds(Named(**solution.problem.parameters), double)
+    return tuple(dict.fromkeys(value for bound in found for value in (double + bound).flatten().tolist()))
 
 
 def _arcs(solution: Solution, ax: Axes, *, labels: bool) -> None:

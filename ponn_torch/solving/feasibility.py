@@ -129,8 +129,9 @@ def least_control_twin(problem: OptimalControlProblem) -> OptimalControlProblem:
     if not isinstance(law, Bounded):
         raise ValueError(f"{problem.name}: its control has no bounds, so that any amount of it is allowed")
     low, high = _bounds(problem)
-    if not low <= 0 <= high:
-        raise ValueError(f"{problem.name}: {law.name} from {low:g} to {high:g}; allowed: bounds that include zero")
+    if not _include_zero(low, high):
+        least, most = (", ".join(f"{value:g}" for value in bound.flatten().tolist()) for bound in (low, high))
+        raise ValueError(f"{problem.name}: {law.name} from {least} to {most}; allowed: bounds that include zero")
 
     def dynamics(t: Tensor, x: Named, u: Named, p: Named) -> dict[str, Tensor]:
         multiple = getattr(x, MULTIPLE)
@@ -164,10 +165,19 @@ def _costate_units(problem: OptimalControlProblem, cost: float, time: float) -> 
     return {name: cost / problem.unit(name) / (1.0 if name == problem.mass else strength) for name in problem.states}
 
 
-def _bounds(problem: OptimalControlProblem) -> tuple[float, float]:
+def _bounds(problem: OptimalControlProblem) -> tuple[Tensor, Tensor]:
+    """Minimum and maximum (), or (size,) where components differ."""
     assert isinstance(problem.control, Bounded)
-    low, high = problem.control.bounds(Named(**problem.parameters))
-    return float(low), float(high)
+    low, high = problem.control.bounds(Named(**problem.parameters), torch.zeros((), dtype=torch.float64))
+    return torch.as_tensor(low, dtype=torch.float64), torch.as_tensor(high, dtype=torch.float64)
+
+
+def _include_zero(low: Tensor, high: Tensor) -> bool:
+    return bool(((low <= 0) & (high >= 0)).all())
+
+
+def _largest(low: Tensor, high: Tensor) -> Tensor:
+    return torch.maximum(low.abs(), high.abs())
 
 
 def _control_strength(problem: OptimalControlProblem) -> float:
@@ -179,7 +189,7 @@ def _control_strength(problem: OptimalControlProblem) -> float:
     x = torch.tensor([start], dtype=torch.float64)
     t = torch.zeros_like(x[:, :1])
     p = Named(**{name: torch.full_like(t, value) for name, value in problem.parameters.items()})
-    full_control = max(map(abs, _bounds(problem)))
+    full_control = _largest(*_bounds(problem))
     least = {name: torch.zeros(1, size, dtype=torch.float64) for name, size in law.names.items()}
 
     def rates(control: Tensor) -> dict[str, Tensor]:
@@ -221,10 +231,10 @@ def check_control(problem: OptimalControlProblem, solver: Solver, seed: int = 0)
     if problem.free_final_time or not isinstance(law, Bounded):
         return None
     low, high = _bounds(problem)
-    if not low <= 0 <= high:
+    if not _include_zero(low, high):
         return None
     solution, seconds = _solved(least_control_twin(problem), solver, seed)
-    allowed = max(-low, high)
+    allowed = float(_largest(low, high).max())
     return ControlNeeded(
         name=law.name,
         allowed=allowed,

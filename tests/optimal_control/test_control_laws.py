@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+from dataclasses import replace
 from types import SimpleNamespace
 
 import pytest
@@ -154,7 +155,8 @@ def test_thrust_minimises_the_regularised_hamiltonian_over_the_ball(
     regulariser, level, primer, minimum, smoothing, seed
 ):
     h = thrust_hamiltonian(tensor([primer]))
-    law = adapted(ThrustBall("thrust", 1.5, minimum, make_regulariser(regulariser), level), h)
+    smoothed = {"regulariser": make_regulariser(regulariser), "switching_level": level}
+    law = adapted(ThrustBall("thrust", 1.5, minimum, **smoothed), h)
     rho = column(smoothing)
     best = law.minimise(h, NONE, column(1.0), Regime(smoothing=rho))
     magnitude = best.control["thrust_magnitude"]
@@ -182,7 +184,7 @@ def test_the_switching_function_of_a_thrust_ball_is_that_of_the_paper():
 
 def test_a_switching_level_shifts_the_smoothed_law_only():
     h = thrust_hamiltonian(tensor([[0.3, 0.4, 0.0]]))
-    plain, shifted = (adapted(ThrustBall("thrust", 1.0, 0.0, Entropy(), level), h) for level in (0.0, 0.25))
+    plain, shifted = (adapted(ThrustBall("thrust", 1.0, switching_level=level), h) for level in (0.0, 0.25))
     regime = Regime(smoothing=column(0.2))
     switching = float(plain.minimise(h, NONE, column(1.0), regime).switching)
     assert float(shifted.minimise(h, NONE, column(1.0), regime).switching) == switching
@@ -236,17 +238,74 @@ def test_bounds_may_be_parameters():
 
 
 @pytest.mark.parametrize("law", [Box, ThrustBall])
-@pytest.mark.parametrize("bound", [[1.0], (0.0, 1.0), None, math.nan, math.inf], ids=repr)
+@pytest.mark.parametrize("bound", [[], (0.0, 1.0, 2.0, 3.0), [math.nan], None, math.nan, math.inf], ids=repr)
 def test_a_bound_is_a_number_or_a_name(law, bound):
     for label in ("minimum", "maximum"):
-        with pytest.raises(ValueError, match=rf"push: {label} = {re.escape(repr(bound))}; allowed: a finite number"):
+        given = re.escape(repr(tuple(bound) if law is Box and isinstance(bound, list) else bound))
+        with pytest.raises(ValueError, match=rf"push: {label} = {given}; allowed: a finite number"):
             law(**{"name": "push", "maximum": 1.0, label: bound})
+
+
+def test_a_ball_has_one_pair_of_bounds():
+    with pytest.raises(ValueError, match=r"push: maximum = \(1.0, 2.0\); allowed: a finite number, or the name"):
+        ThrustBall("push", (1.0, 2.0), size=2)
+
+
+@pytest.mark.parametrize("law", [Box, ThrustBall])
+@pytest.mark.parametrize("size", [0, -1, 1.5, Entropy()], ids=repr)
+def test_a_size_is_a_whole_number(law, size):
+    with pytest.raises(ValueError, match=re.escape(f"push: size = {size!r}; allowed: a whole number from 1")):
+        law("push", 1.0, 0.0, size)
+
+
+@pytest.mark.parametrize("law", [Box, ThrustBall])
+@pytest.mark.parametrize("regulariser", ["entropy", Entropy, None, 1.0], ids=repr)
+def test_a_regulariser_is_an_object_with_its_methods(law, regulariser):
+    given = re.escape(repr(regulariser))
+    with pytest.raises(ValueError, match=rf"push: regulariser = {given}; allowed: Entropy\(\), Quadratic\(\)"):
+        law("push", 1.0, regulariser=regulariser)
+
+
+def test_names_bounds_and_sizes_go_by_position_and_the_rest_by_keyword():
+    assert Box("push", 2.0, -1.0, 3) == Box(name="push", maximum=2.0, minimum=-1.0, size=3)
+    assert ThrustBall("push", 2.0, 1.0, 2).names == {"push": 2, "push_magnitude": 1}
+    with pytest.raises(TypeError, match="positional"):
+        Box("push", 1.0, 0.0, 1, Entropy())
 
 
 @pytest.mark.parametrize(("minimum", "maximum"), [(-0.1, 1.0), (1.0, 1.0), (2.0, 1.0)])
 def test_impossible_thrust_bounds_are_named(minimum, maximum):
     with pytest.raises(ValueError, match=rf"thrust: minimum = {minimum}, maximum = {maximum}; 0 ≤ minimum <"):
-        adapted(ThrustBall("thrust", maximum, minimum), thrust_hamiltonian(tensor([[1.0, 0.0, 0.0]])))
+        ThrustBall("thrust", maximum, minimum)
+
+
+def test_bounds_that_are_parameters_are_compared_when_their_values_are_known():
+    p = SimpleNamespace(most=1.0 * ONE, least=2.0 * ONE)
+    h = thrust_hamiltonian(tensor([[1.0, 0.0, 0.0]]))
+    with pytest.raises(ValueError, match=r"thrust: minimum = least, maximum = most; 0 ≤ minimum < maximum"):
+        ThrustBall("thrust", "most", "least").adapted(h, lambda thrust, thrust_magnitude: ONE, p, ONE, 1.0)
+
+
+@pytest.mark.parametrize(
+    "cost",
+    [
+        lambda thrust, magnitude: (thrust**2).sum(-1, keepdim=True),
+        lambda thrust, magnitude: thrust.norm(dim=-1, keepdim=True),
+        lambda thrust, magnitude: magnitude * thrust[..., :1],
+    ],
+    ids=["square", "norm", "product"],
+)
+def test_a_ball_needs_a_hamiltonian_linear_in_the_vector(cost):
+    def h(thrust: Tensor, thrust_magnitude: Tensor) -> Tensor:
+        return thrust_hamiltonian(tensor([[1.0, 0.5, 0.0]]))(thrust, thrust_magnitude) + cost(thrust, thrust_magnitude)
+
+    with pytest.raises(ValueError, match=r"not linear in the vector u.thrust; .* u.thrust_magnitude"):
+        adapted(ThrustBall("thrust", 2.0), h)
+
+
+def test_a_magnitude_enters_up_to_its_square():
+    with pytest.raises(ValueError, match="thrust: the Hamiltonian is neither affine nor quadratic in its magnitude"):
+        adapted(ThrustBall("thrust", 2.0), lambda thrust, thrust_magnitude: thrust_magnitude**3, None)
 
 
 # -- boxes ---------------------------------------------------------------------------------------------------
@@ -264,7 +323,8 @@ def separable(slopes: Tensor, curvatures: Tensor):
 @given(slopes=st.lists(st.floats(-3, 3), min_size=3, max_size=3), seed=st.integers(0, 1000))
 def test_every_component_of_a_box_minimises_its_part(regulariser, slopes, seed):
     h, rho = affine(tensor([slopes])), column(0.3)
-    law = adapted(Box("u", 2.0, -1.0, make_regulariser(regulariser), size=3), affine(tensor([1.0, 2.0, 3.0])), None)
+    law = Box("u", 2.0, -1.0, 3, regulariser=make_regulariser(regulariser))
+    law = adapted(law, affine(tensor([1.0, 2.0, 3.0])), None)
     best = law.minimise(h, NONE, column(1.0), Regime(smoothing=rho))
     assert not law.curved
     assert law.cost_rate == pytest.approx(1 / 3)  # the scale of H over the range
@@ -319,9 +379,68 @@ def test_a_box_with_a_coupled_hamiltonian_is_refused():
         adapted(Box("u", 1.0, -1.0, size=2), lambda u: (u[..., :1] * u[..., 1:]) + u.sum(-1, keepdim=True), None)
 
 
+def test_a_product_of_three_components_is_coupled():
+    """All its mixed slopes vanish at the corner of the box."""
+    with pytest.raises(ValueError, match="u: the Hamiltonian couples its components"):
+        adapted(Box("u", 1.0, 0.0, 3), lambda u: u.prod(-1, keepdim=True) + u.sum(-1, keepdim=True), None)
+
+
+@pytest.mark.parametrize("part", [lambda u: u**4, torch.exp, torch.abs], ids=["quartic", "exponential", "kink"])
+def test_a_box_needs_a_hamiltonian_up_to_squares(part):
+    def h(u: Tensor) -> Tensor:
+        return 0.1 * u[..., :1] ** 2 + part(u[..., 1:]) + u.sum(-1, keepdim=True)
+
+    cures = "Stationary over the same range, a kink as in .u. a ThrustBall or two non-negative parts of u"
+    with pytest.raises(ValueError, match=f"u: .* neither affine nor quadratic in component 1; .*{cures}"):
+        adapted(Box("u", 4.0, -4.0, 2), h, None)
+
+
+def test_curvature_that_turns_with_the_costate_is_concave_somewhere():
+    costates = tensor([[0.4], [1.0], [-0.4], [-1.0]])  # two and their opposites
+    with pytest.raises(ValueError, match=r"u: the Hamiltonian is concave in component 0; .*Stationary"):
+        adapted(Box("u", 1.0, -1.0), lambda u: costates * (u + 0.25 * u**2), None)
+    # a running cost that outweighs a small costate decides
+    assert adapted(Box("u", 1.0, -1.0), lambda u: costates * (u + 0.25 * u**2) + 0.2 * u**2, None).curved
+
+
+def test_curvature_that_turns_with_the_state_is_left_to_the_certificate():
+    masses = tensor([[1.0], [-1.0], [1.0], [-1.0]])
+    assert adapted(Box("u", 1.0, -1.0), lambda u: masses * u**2 + u, None).curved
+
+
 def test_impossible_box_bounds_are_named():
     with pytest.raises(ValueError, match=r"u: minimum = 1.0, maximum = -1.0; minimum < maximum"):
-        adapted(Box("u", -1.0, 1.0), affine(tensor([1.0])), None)
+        Box("u", -1.0, 1.0)
+    with pytest.raises(ValueError, match=r"u: minimum = 1.0, maximum = \(2.0, 1.0\); minimum < maximum"):
+        Box("u", (2.0, 1.0), 1.0, 2)
+
+
+@pytest.mark.parametrize("quadratic", [0.0, 1.0])
+@pytest.mark.parametrize("name", REGULARISERS)
+def test_bounds_per_component_are_equal_bounds_of_other_units(name, quadratic):
+    """u = b v: the same H, switching functions, penalty and arcs."""
+    low, high, slopes = tensor([-1.0, -6.0]), tensor([0.5, 2.0]), random(40, 2, seed=1, low=-3.0, high=3.0)
+    one, rho, middle, half = slopes[:, :1] ** 0, tensor([[0.4]]), (low + high) / 2, (high - low) / 2
+
+    def h(u: Tensor) -> Tensor:
+        return (slopes * u + quadratic * u**2).sum(-1, keepdim=True)
+
+    def rescaled(u: Tensor) -> Tensor:
+        return h(middle + half * u)
+
+    cost = lambda u: 0.0 * u[..., :1]  # noqa: E731
+    laws = Box("u", high.tolist(), low.tolist(), 2), Box("u", 1.0, -1.0, 2)
+    laws = [replace(law, regulariser=make_regulariser(name)) for law in laws]
+    laws = [law.adapted(f, cost, NONE, one, 1.0) for law, f in zip(laws, (h, rescaled), strict=True)]
+    for regime in (Regime(smoothing=rho), Regime(), Regime(arcs=torch.full((40, 2), UPPER))):
+        found, expected = (law.minimise(f, NONE, one, regime) for law, f in zip(laws, (h, rescaled), strict=True))
+        close = {"rtol": 1e-13, "atol": 1e-13}
+        torch.testing.assert_close(found.control["u"], middle + half * expected.control["u"], **close)
+        torch.testing.assert_close(found.switching, expected.switching, **close)
+        if regime.smoothing is not None:
+            penalties = [law.penalty(best, NONE, rho) for law, best in zip(laws, (found, expected), strict=True)]
+            torch.testing.assert_close(*penalties, **close)
+    assert bool((laws[0].probe(one)["u"] > low).all() & (laws[0].probe(one)["u"] < high).all())
 
 
 # -- no bounds -----------------------------------------------------------------------------------------------
@@ -345,3 +464,24 @@ def test_a_quadratic_hamiltonian_has_one_step_to_its_minimum(seed):
 def test_a_hamiltonian_that_is_not_quadratic_has_no_closed_form():
     with pytest.raises(ValueError, match=r"control 'u': the Hamiltonian is not quadratic"):
         adapted(Unconstrained("u", 1), lambda u: u**4, None)
+
+
+def test_cubes_that_cancel_on_the_diagonal_are_seen():
+    with pytest.raises(ValueError, match=r"control 'u': the Hamiltonian is not quadratic"):
+        adapted(
+            Unconstrained("u", 2),
+            lambda u: (u**2).sum(-1, keepdim=True) + 0.05 * (u[..., :1] ** 3 - u[..., 1:] ** 3),
+            None,
+        )
+
+
+@pytest.mark.parametrize("signs", [[-1.0, -1.0], [1.0, -1.0]])
+def test_a_stationary_point_that_is_no_minimum_is_refused(signs):
+    with pytest.raises(ValueError, match="control 'u': H_uu is positive definite at none of the probes"):
+        adapted(Unconstrained("u", 2), lambda u: (ONE * tensor(signs) * u**2 + u).sum(-1, keepdim=True), None)
+
+
+def test_a_hamiltonian_convex_at_some_probes_is_left_to_the_certificate():
+    signs = tensor([[1.0], [0.0], [-1.0], [-1.0]])
+    law = Unconstrained("u", 1)
+    assert adapted(law, lambda u: signs * u**2 + u, None) is law

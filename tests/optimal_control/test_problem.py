@@ -119,12 +119,29 @@ def test_a_law_without_closed_form_is_refused():
 def test_bounds_must_leave_room():
     made = OptimalControlProblem(
         **statement(
-            control=ThrustBall("force", 1.0, 2.0, size=2),
+            control=ThrustBall("force", "strength", 2.0, size=2),
+            parameters={"strength": 1.0},
             running_cost=lambda t, x, u, p: u.force_magnitude,
         )
     )
-    with pytest.raises(ValueError, match=r"force: minimum = 2.0, maximum = 1.0; 0 ≤ minimum < maximum"):
+    with pytest.raises(ValueError, match=r"force: minimum = 2.0, maximum = strength; 0 ≤ minimum < maximum"):
         pontryagin(made)
+
+
+def test_what_is_far_above_its_unit_is_named_with_a_unit_for_it():
+    def hint(**changes: Any) -> str:
+        return OptimalControlProblem(**statement(**changes)).scaling_hint()
+
+    assert hint() == ""
+    far = {"initial": {"position": (0.0, -7.3e6), "velocity": 2e3}}
+    assert hint(**far) == (
+        "initial position is 7.3e+06 of its unit, 1; unknowns should be of order one: set units['position'] to about "
+        "7e+06"
+    )
+    assert hint(**far, units={"position": 1e7, "velocity": 1e3}) == ""
+    assert "initial velocity is 2.0e+03 of its unit, 1" in hint(**far, units={"position": 1e7})
+    assert "final_time is 8.6e+04 of its unit, 1; " in hint(final_time=FreeTime(86400.0))
+    assert hint(final_time=86400.0, units={"time": 86400.0}) == ""
 
 
 def test_boundary_data_are_filled_by_component():
