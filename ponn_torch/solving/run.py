@@ -117,6 +117,8 @@ class Run:
         if not n_certified and not interrupted and len(self.causes) > 1:
             tally = ", ".join(f"{count} × {cause}" for cause, count in Counter(self.causes).most_common())
             message = f"{message}; of {len(begun)} starts: {tally}"
+        if not n_certified and (hint := self.problem.scaling_hint()):
+            message = f"{message}; {hint}"
         spent = self.clock.spent and n_certified < self.solver.n_certified
         if spent and not (best and best[1].certified) and Status.BUDGET.value not in message:
             message = f"{Status.BUDGET.value}: {message}"

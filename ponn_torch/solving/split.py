@@ -119,6 +119,8 @@ class Split(Segmentation, Refinement):
                 continue
             sharper = factor * smoothing
             times = graded_times(start, sharper, least)
+            if len(times) - 1 > self.max_segments:  # as where a component of the control has no effect, and S is noise
+                return
             collocation = Collocation.on_segments(search.discretisation, times, setting=start.collocation.setting)
             curve, result = self.solve(collocation.with_setting(smoothing=sharper), start, search.callback)
             search.rounds.append(result)
