@@ -199,15 +199,41 @@ class BoundaryValueProblem:
 
     def hamiltonian(self, t: Tensor, w: Tensor, setting: Setting) -> Tensor:
         """The Hamiltonian (..., 1) that the setting's law minimises, regulariser included, in cost_unit/time_unit."""
-        x, costates = self.to_physical(w)
-        p, best = self._parameters(setting), self.minimiser(t, w, setting)
+        best = self.minimiser(t, w, setting)
         # at the minimiser H is stationary in the control, so its derivative is that at fixed control; through a
         # saturated η it would be 0 · ∞
         best = Minimiser({k: v.detach() for k, v in best.control.items()}, best.switching, best.fraction.detach())
-        h = self._hamiltonian(t * self.time_unit, x, costates, Named(**best.control), p)[0]
+        return self._hamiltonian_at(best, t, w, setting)
+
+    def _hamiltonian_at(self, chosen: Minimiser, t: Tensor, w: Tensor, setting: Setting) -> Tensor:
+        """The same at any control, and η, instead of the minimiser."""
+        x, costates = self.to_physical(w)
+        p = self._parameters(setting)
+        h = self._hamiltonian(t * self.time_unit, x, costates, Named(**chosen.control), p)[0]
         if setting.regime.smoothing is not None and setting.regime.arcs is None:
-            h = h + self.law.penalty(best, p, setting.regime.smoothing)
+            h = h + self.law.penalty(chosen, p, setting.regime.smoothing)
         return h * (self.time_unit / self.cost_unit)
+
+    def excess(self, t: Tensor, w: Tensor, setting: Setting) -> Tensor:
+        """By how much H at the setting's control exceeds H at admissible samples at most, in cost_unit/time_unit.
+
+        (m, 1) at points t (m, 1), w (m, 2n); not above zero where the control minimises H.
+        """
+        best = self.minimiser(t, w, setting)
+        others = self.law.samples(best, self._parameters(setting))
+        count = len(next(iter(others.control.values())))
+
+        def each(value: Tensor) -> Tensor:  # in one list, as all functions of a problem are called
+            return value.expand(count, *value.shape).flatten(0, 1)
+
+        smoothing, arcs = (None if v is None else each(v) for v in (setting.regime.smoothing, setting.regime.arcs))
+        there = Setting(Regime(smoothing, arcs), {name: each(value) for name, value in setting.parameters.items()})
+        control = {name: value.flatten(0, 1) for name, value in others.control.items()}
+        listed = Minimiser(control, best.switching, others.fraction.flatten(0, -2))
+        h = self._hamiltonian_at(listed, each(t), each(w), there)
+        # what H is not defined at is no better control
+        h = torch.where(h.isnan(), torch.inf, h).unflatten(0, (count, len(t)))
+        return self._hamiltonian_at(best, t, w, setting) - h.amin(0)
 
     def running_cost(self, t: Tensor, w: Tensor, setting: Setting) -> Tensor:
         """The user's running cost (..., 1), without the regulariser, in cost_unit/time_unit."""

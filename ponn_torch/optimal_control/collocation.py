@@ -108,6 +108,17 @@ class Collocation:
                 raise ValueError(f"no parameter {name!r}; {nearest(name, ['smoothing', 'final_time', *values])}")
         return replace(out, setting=Setting(regime, values))
 
+    def departures(self) -> dict[str, tuple[float, float]]:
+        """Parameters, and a fixed final time in s, that are not as the problem states them: name → (here, stated)."""
+        problem = self.bvp.problem
+        found = {
+            name: (float(self.setting.parameters.get(name, value)), value) for name, value in problem.parameters.items()
+        }
+        if not problem.free_final_time:
+            found["final_time"] = float(self.known_times[-1]) * self.bvp.time_unit, problem.time_guess
+        round_off = 64 * torch.finfo(self.known_times.dtype).eps
+        return {name: (a, b) for name, (a, b) in found.items() if abs(a - b) > round_off * abs(b)}
+
     # -- layout ------------------------------------------------------------------------------------------------------
 
     @property

@@ -21,6 +21,7 @@ import torch
 from torch import Tensor
 
 from ponn_torch.numerics.autodiff import gradients
+from ponn_torch.optimal_control import sampling
 from ponn_torch.optimal_control.regularisers import Entropy, Regulariser
 
 Hamiltonian = Callable[..., Tensor]
@@ -147,6 +148,10 @@ class ControlSet(Protocol):
         """Arc codes (..., m) that the minimum principle asks for, from the switching functions."""
         ...
 
+    def samples(self, minimiser: Minimiser, p: Any) -> Minimiser:
+        """Other admissible controls, and their η, on a new first axis: far from the given one and near it."""
+        ...
+
 
 @dataclass(frozen=True)
 class Unconstrained:
@@ -216,6 +221,12 @@ class Unconstrained:
 
     def arc_codes(self, switching: Tensor) -> Tensor:
         return torch.zeros_like(switching, dtype=torch.long)
+
+    def samples(self, minimiser: Minimiser, p: Any) -> Minimiser:
+        u = minimiser.control[self.name]
+        size = u.abs().flatten(0, -2).amax(0)
+        size = torch.where(size > 0, size, 1.0)
+        return minimiser._replace(control={self.name: u + size * sampling.steps(u)})
 
 
 Bound = float | str | Sequence[float]
@@ -387,6 +398,17 @@ class ThrustBall(Bounded):
         control = self._controls(-(magnitude * inverse) * primer, magnitude)
         return Minimiser(control, self._switching(at_lower, at_upper), fraction)
 
+    def samples(self, minimiser: Minimiser, p: Any) -> Minimiser:
+        low, high = self.bounds(p)
+        vector, eta = minimiser.control[self.name], minimiser.fraction
+        some = vector.abs().amax(-1, keepdim=True) > 0
+        own = sampling.unit(torch.where(some, vector, torch.eye(self.size).to(vector)[0]))
+        along, turned, any_way = sampling.fractions(eta), sampling.unit(own + sampling.steps(own)), sampling.ways(own)
+        direction = torch.cat([own.expand(len(along), *own.shape), turned, any_way])
+        fraction = torch.cat([along, eta.expand(len(turned), *eta.shape), along[: len(any_way)]])
+        magnitude = low + (high - low) * fraction
+        return minimiser._replace(control=self._controls(magnitude * direction, magnitude), fraction=fraction)
+
 
 @dataclass(frozen=True)
 class Box(Bounded):
@@ -466,3 +488,8 @@ class Box(Bounded):
         at_upper = self._scaled(-self._slope(h, zero + high)) if self.curved else at_lower
         fraction = _fraction(at_lower, at_upper, self.curved, self, regime)
         return Minimiser({self.name: low + (high - low) * fraction}, self._switching(at_lower, at_upper), fraction)
+
+    def samples(self, minimiser: Minimiser, p: Any) -> Minimiser:
+        low, high = self.bounds(p)
+        fraction = sampling.fractions(minimiser.fraction)
+        return minimiser._replace(control={self.name: low + (high - low) * fraction}, fraction=fraction)

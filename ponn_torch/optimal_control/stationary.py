@@ -17,6 +17,7 @@ import torch
 from torch import Tensor
 
 from ponn_torch.numerics.autodiff import gradients, gradients_and_values
+from ponn_torch.optimal_control import sampling
 from ponn_torch.optimal_control.control_laws import Hamiltonian, Minimiser, Regime
 
 
@@ -106,6 +107,11 @@ class Stationary:
 
     def arc_codes(self, switching: Tensor) -> Tensor:
         return torch.zeros_like(switching, dtype=torch.long)
+
+    def samples(self, minimiser: Minimiser, p: Any) -> Minimiser:
+        width = self.maximum - self.minimum
+        fraction = sampling.fractions((minimiser.control[self.name] - self.minimum) / width)
+        return minimiser._replace(control={self.name: self.minimum + width * fraction})
 
     # -- the minimum at fixed states and costates --------------------------------------------------------------
 

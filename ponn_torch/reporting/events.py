@@ -32,6 +32,7 @@ JUDGED = (
     "end_error_scaled",
     "control_end_error_scaled",
     "hamiltonian_drift",
+    "minimality",
     "off_node_residual",
     "sign_violation",
     "transversality",

@@ -2,7 +2,8 @@
 
 *Converged* is what an optimiser says; *certified* is what this page says. The state–costate equations are
 flown from the found start, and apart from that the control alone through the dynamics; the Hamiltonian, the
-signs of the switching functions, transversality and the residual between nodes are held to tolerances.
+signs of the switching functions, transversality and the residual between nodes are held to tolerances. The law that
+made the solution is no judge of itself: H is compared with its values at other admissible controls.
 """
 
 from __future__ import annotations
@@ -30,7 +31,9 @@ class Tolerances:
         hamiltonian_drift: of H, less the integral of ∂H/∂t, relative to the largest Σ|terms of H|.
         off_node_residual: |ẇ − F| between the nodes, the segments' worst averaged over time.
         sign_violation: depth of S on the wrong side of zero.
-        transversality: final costates of free states, and the row of a free final time.
+        transversality: final costates of free states relative to the largest scaled |costate|, and the row of a free
+            final time relative to the largest Σ|terms of H|.
+        minimality: H above its value at other admissible controls, relative to the same.
     """
 
     end_error: float = 1e-9
@@ -38,6 +41,7 @@ class Tolerances:
     off_node_residual: float = 1e-8
     sign_violation: float = 1e-9
     transversality: float = 1e-9
+    minimality: float = 1e-9
 
     def __post_init__(self) -> None:
         for item in fields(self):
@@ -57,7 +61,10 @@ class Certificate:
         control_end_error_scaled, control_end_errors: the same for the control alone.
         sign_violation: deepest S on the wrong side; None where no arcs are claimed.
         singular_share: largest share of a bang arc over which S is zero to tolerance; None without arcs.
-        free_time: |H + ∂φ/∂t| at the end, scaled; None for a fixed final time.
+        transversality: worst |λ − φ_x − ψ_xᵀν| at the end, relative to the largest |λ|, both scaled.
+        free_time: |H + ∂φ/∂t| at the end, relative to the largest Σ|terms of H|; None for a fixed final time.
+        minimality: largest H(u*) − H(u) over samples u of the admissible set, relative to the same; None in
+            certificates of before it was measured.
         cost, flown_cost, known_cost, cost_error: user units; cost_error = flown − known.
         explicit_time: H depends on time by itself; its drift is then measured against ∫ ∂H/∂t dt.
         seconds: CPU time.
@@ -83,6 +90,7 @@ class Certificate:
     cost_error: float | None
     explicit_time: bool
     n_restarts: int = 0
+    minimality: float | None = None
     tolerances: Tolerances = field(default_factory=Tolerances)
     seconds: float = 0.0
 
@@ -104,6 +112,7 @@ class Certificate:
             (f"end error, states and costates flown{again}", self.end_error_scaled, t.end_error),
             ("end error, control alone flown", self.control_end_error_scaled, t.end_error),
             ("drift of the Hamiltonian", self.hamiltonian_drift, t.hamiltonian_drift),
+            ("H above its minimum over the control", self.minimality, t.minimality),
             ("switching function on the wrong side", self.sign_violation, t.sign_violation),
             ("share of an arc with S = 0", self.singular_share, SINGULAR_SHARE),
             ("residual between the nodes", self.off_node_residual, t.off_node_residual),
@@ -139,7 +148,8 @@ def certify(solution: Solution, tolerances: Tolerances | None = None) -> Certifi
 
     end_scaled, ends = checks.end_errors(solution, extremal)
     control_scaled, control_ends = checks.control_end_errors(solution, control)
-    transversality, manifold, free_time = checks.terminal(solution, extremal)
+    h, terms = checks.hamiltonian(solution, extremal)
+    transversality, manifold, free_time = checks.terminal(solution, extremal, terms)
     sign, singular = checks.signs(solution, tolerances.sign_violation)
     flown_cost = checks.flown_cost(solution, control)
     known = solution.problem.known_cost
@@ -148,7 +158,8 @@ def certify(solution: Solution, tolerances: Tolerances | None = None) -> Certifi
         "end_errors": ends,
         "control_end_error_scaled": control_scaled,
         "control_end_errors": control_ends,
-        "hamiltonian_drift": checks.hamiltonian_drift(solution, extremal, explicit_time),
+        "hamiltonian_drift": checks.hamiltonian_drift(extremal, h, terms, explicit_time),
+        "minimality": checks.minimality(solution, extremal, terms),
         "sign_violation": sign,
         "singular_share": singular,
         "off_node_residual": solution.curve.mean_residual(),
@@ -161,7 +172,7 @@ def certify(solution: Solution, tolerances: Tolerances | None = None) -> Certifi
         "explicit_time": explicit_time,
         "n_restarts": len(extremal.jumps),
     }
-    faults = _faults(solution, measured, tolerances)
+    faults = checks.departures(solution) + _faults(measured, tolerances)
     faults += [flight.message for flight in (extremal, control) if not flight.arrived]
     return Certificate(
         certified=not faults,
@@ -174,14 +185,15 @@ def certify(solution: Solution, tolerances: Tolerances | None = None) -> Certifi
     )
 
 
-# -- the verdi -----------------------------------------------------------------------------------------------
+# -- the verdict ---------------------------------------------------------------------------------------------
 
 
-def _faults(solution: Solution, measured: Mapping[str, Any], t: Tolerances) -> list[str]:
+def _faults(measured: Mapping[str, Any], t: Tolerances) -> list[str]:
     limits = {
         "end_error_scaled": t.end_error,
         "control_end_error_scaled": t.end_error,
         "hamiltonian_drift": t.hamiltonian_drift,
+        "minimality": t.minimality,
         "sign_violation": t.sign_violation,
         "off_node_residual": t.off_node_residual,
         "transversality": t.transversality,
@@ -215,6 +227,7 @@ def _refused(solution: Solution, tolerances: Tolerances) -> Certificate:
         control_end_error_scaled=math.inf,
         control_end_errors=dict(ends),
         hamiltonian_drift=math.inf,
+        minimality=math.inf,
         sign_violation=math.inf if solution.kind == "split" else None,
         singular_share=0.0 if solution.kind == "split" else None,
         off_node_residual=math.inf,

@@ -58,6 +58,12 @@ def _by_state(solution: Solution, x: Tensor) -> dict[str, float]:
     return errors
 
 
+def departures(solution: Solution) -> list[str]:
+    """What the curve solves in place of the problem as stated."""
+    found = solution.curve.collocation.departures()
+    return [f"{name} = {value:.10g} where the problem states {stated:.10g}" for name, (value, stated) in found.items()]
+
+
 def end_errors(solution: Solution, flight: Flight) -> tuple[float, dict[str, float]]:
     """Boundary conditions of the flown extremal: worst scaled component, jumps among them; final norms per state."""
     bvp, n = solution.reference, solution.bvp.n_states
@@ -80,8 +86,19 @@ def control_end_errors(solution: Solution, flight: Flight) -> tuple[float, dict[
     return _worst(((x - known) / bvp.unit)[given]), _by_state(solution, x)
 
 
-def terminal(solution: Solution, flight: Flight) -> tuple[float, float, float | None]:
-    """(transversality, manifold, free time) at the end of the flown extremal, scaled."""
+def _relative(error: float, size: float) -> float:
+    """error / size; 0 where there is no error, infinite where there is no finite quotient."""
+    if error == 0.0:
+        return 0.0
+    return error / size if size > 0 and math.isfinite(error / size) else math.inf
+
+
+def terminal(solution: Solution, flight: Flight, terms: float) -> tuple[float, float, float | None]:
+    """(transversality, manifold, free time) at the end of the flown extremal.
+
+    Relative to the largest scaled |costate|, scaled, and relative to the largest Σ|terms of H|: costs of another size
+    ask for the same digits.
+    """
     bvp, n = solution.reference, solution.bvp.n_states
     if not flight.arrived:
         return math.inf, math.inf, math.inf if solution.problem.free_final_time else None
@@ -93,8 +110,14 @@ def terminal(solution: Solution, flight: Flight) -> tuple[float, float, float | 
     rows = bvp.terminal_rows(t, w, multipliers, setting)[0]
     n_costates = len(bvp.terminal_components)
     n_manifold = n_costates + bvp.n_multipliers
-    free_time = _worst(rows[n_manifold:]) if solution.problem.free_final_time else None
-    return _worst(torch.cat([costates, rows[:n_costates]])), _worst(rows[n_costates:n_manifold]), free_time
+    free_time = _relative(_worst(rows[n_manifold:]), terms) if solution.problem.free_final_time else None
+    transversality = _relative(_worst(torch.cat([costates, rows[:n_costates]])), _largest_costate(solution, flight))
+    return transversality, _worst(rows[n_costates:n_manifold]), free_time
+
+
+def _largest_costate(solution: Solution, flight: Flight) -> float:
+    n = solution.bvp.n_states
+    return float(abs(flight.y[:, n : 2 * n]).max())
 
 
 def flown_cost(solution: Solution, flight: Flight) -> float:
@@ -118,21 +141,42 @@ def depends_on_time(solution: Solution) -> bool:
     return bool((_time_slope(solution, t.double().cpu()[:, None], w.double().cpu(), setting) != 0).any())
 
 
-def hamiltonian_drift(solution: Solution, flight: Flight, explicit_time: bool) -> float:
-    """(max − min of H − ∫∂H/∂t) / max Σ|terms of H| along the flown extremal."""
+def _flown(solution: Solution, flight: Flight) -> tuple[Tensor, Tensor, Setting]:
+    """(t (m, 1), w (m, 2n), setting) at the steps of a flown extremal."""
+    w = torch.from_numpy(flight.y[:, : solution.bvp.dimension].copy())
+    return torch.from_numpy(flight.t)[:, None], w, _settings(solution, _segments(solution, flight))
+
+
+def hamiltonian(solution: Solution, flight: Flight) -> tuple[Tensor, float]:
+    """H (m, 1) along the flown extremal, and the largest Σ|terms of H|, which errors of H are held against."""
     bvp, n = solution.reference, solution.bvp.n_states
-    y = torch.from_numpy(flight.y)
-    t, w = torch.from_numpy(flight.t)[:, None], y[:, : bvp.dimension]
-    setting = _settings(solution, _segments(solution, flight))
+    t, w, setting = _flown(solution, flight)
     h = bvp.hamiltonian(t, w, setting)
     power = bvp.conjugate * w[:, n:] * bvp.rates(t, w, setting)[:, :n] / bvp.cost_unit
     cost = bvp.running_cost(t, w, setting)
     penalty = h - power.sum(-1, keepdim=True) - cost
     terms = power.abs().sum(-1, keepdim=True) + cost.abs() + penalty.abs()
+    return h, float(terms.max())
+
+
+def hamiltonian_drift(flight: Flight, h: Tensor, terms: float, explicit_time: bool) -> float:
+    """(max − min of H − ∫∂H/∂t) / max Σ|terms of H| along the flown extremal."""
     if explicit_time:
-        h = h - y[:, -1:]
-    drift = float((h.max() - h.min()) / terms.max())
-    return drift if math.isfinite(drift) else math.inf
+        h = h - torch.from_numpy(flight.y[:, -1:])
+    return _relative(float(h.max() - h.min()), terms)
+
+
+def minimality(solution: Solution, flight: Flight, terms: float, n_points: int = 64) -> float:
+    """Largest H(u*) − H(u) / max Σ|terms of H| over samples u of the admissible set, at steps of the flown extremal.
+
+    u* is the control flown. H is the one that its regime minimises, taken from the problem's functions alone.
+    """
+    t, w, setting = _flown(solution, flight)
+    chosen = torch.linspace(0, len(t) - 1, n_points).round().long().unique()
+    regime = Regime(*(None if v is None else v[chosen] for v in (setting.regime.smoothing, setting.regime.arcs)))
+    setting = Setting(regime, {name: value[chosen] for name, value in setting.parameters.items()})
+    excess = float(solution.reference.excess(t[chosen], w[chosen], setting).max())
+    return _relative(max(excess, 0.0), terms) if math.isfinite(excess) else math.inf
 
 
 # -- signs of the switching functions ------------------------------------------------------------------------

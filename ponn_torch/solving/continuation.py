@@ -20,14 +20,14 @@ class Outcome(Enum):
 
     SOLVED = "solved"
     UNCHANGED = "solved, and the same as before: smaller values change nothing"
-    LEGIBLE = "solved, and sharp enough for what comes next"
+    LEGIBLE = "solved, and sharp enough for what comes next: this schedule is done"
     UNTRUSTED = "solved at the nodes, but not between them"
     FAILED = "not solved"
     ABORT = "give this start up"
 
     @property
     def final(self) -> bool:
-        """Nothing more is to be tried."""
+        """Nothing more of a schedule is to be tried."""
         return self in (Outcome.ABORT, Outcome.LEGIBLE)
 
 
@@ -44,6 +44,8 @@ class Schedule(Protocol):
 @dataclass(frozen=True)
 class Ladder:
     """A fixed list of values, each tried once from the solution of the one before; failures do not stop it.
+
+    In another parameter than the smoothing it need not end at the problem's own value: a last stage returns to it.
 
     ``form`` replaces the residual's form for this ladder (a weak form below the node spacing, say);
     ``stop_unchanged`` ends it where a step changes nothing.
@@ -120,7 +122,7 @@ class Adaptive:
 
 @dataclass(frozen=True)
 class Phases:
-    """Schedules one after the other: strong rungs first, then weak ones, then a polish."""
+    """Schedules one after the other: strong rungs first, then weak ones, then a polish; giving up ends them all."""
 
     phases: Sequence[Schedule]
 
@@ -130,7 +132,7 @@ class Phases:
         def watched(value: float, parameter: str, form: Form | None, *, hold: bool = False) -> Outcome:
             nonlocal gone
             outcome = attempt(value, parameter, form, hold=hold)
-            gone = gone or outcome.final
+            gone = gone or outcome is Outcome.ABORT
             return outcome
 
         for phase in self.phases:

@@ -201,6 +201,7 @@ class Run:
         """Walk the schedule from one start; the stages that can be trusted, the sharpest last, or none and why."""
         walk = Walk(self, collocation, xi)
         self.solver.continuation.run(walk)
+        walk.arrive()
         return walk.kept, walk.message
 
     def coarse(self, result: OptimizeResult) -> bool:

@@ -1,4 +1,4 @@
-"""One start on its way down the schedule of smoothings: what it has solved, and which stages can be trusted."""
+"""One start on its way down the schedule: what it has solved, and which stages can be trusted."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 class Walk:
     """One start on its way down the schedule: where it stands, and the stages so far that can be trusted.
 
-    n_failed: first stages that failed; until one has not, the walk has not begun.
+    n_failed: first stages that failed; until one has not, the walk has not begun. form: of the last stage tried.
     """
 
     run: Run
@@ -33,12 +33,14 @@ class Walk:
     message: str = ""
     begun: bool = False
     n_failed: int = 0
+    form: Form | None = None
 
     def __call__(self, value: float, parameter: str, form: Form | None, *, hold: bool = False) -> Outcome:
         """Solve one stage from where the walk stands; ``hold``: stay there if it cannot be trusted."""
         run, smoothed = self.run, self.run.smoothable or parameter != "smoothing"
         if self.begun and (run.clock.spent or not smoothed):  # nothing to smooth: one stage is all there is
             return Outcome.ABORT
+        self.form = form
         trial = replace(self.collocation, discretisation=run.discretisation(form))
         if smoothed:
             trial = trial.with_setting(**{parameter: value})
@@ -56,6 +58,23 @@ class Walk:
         if norm < run.solver.start_limit:
             return self._advanced(trial, result.xi, solution, hold)
         return Outcome.FAILED if self.begun else self._not_begun(solution, result, norm, parameter)
+
+    def arrive(self) -> None:
+        """End at the problem as stated: a last stage where the schedule ended at another value of a parameter.
+
+        Stages on the way there solve other problems and are no candidates.
+        """
+        away = self.collocation.departures()
+        for name, (_, stated) in away.items():
+            self.kept = self._as_stated()
+            self(stated, name, self.form)
+        self.kept = self._as_stated()
+        if away and not self.kept:
+            where = "; ".join(f"{name} = {value:.10g}, stated {stated:.10g}" for name, (value, stated) in away.items())
+            self.message = f"the continuation does not reach the problem as stated from {where}"
+
+    def _as_stated(self) -> list[Solution]:
+        return [solution for solution in self.kept if not solution.curve.collocation.departures()]
 
     def _advanced(self, trial: Collocation, xi: Tensor, solution: Solution, hold: bool) -> Outcome:
         """A stage that is solved: the walk goes there, and keeps it if it can be trusted."""
@@ -79,6 +98,7 @@ class Walk:
         """A first stage that failed; at the next smoothing it is tried once more."""
         run = self.run
         if run.coarse(result):
+            self.collocation, self.xi = solution.curve.collocation, result.xi
             self.kept.append(solution)  # what a refinement on segments starts from, if not a solution
             return Outcome.ABORT
         self.message = (

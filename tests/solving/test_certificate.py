@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import json
 import math
-from dataclasses import replace
+import re
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -24,9 +26,14 @@ from analytic import (
 
 from ponn_torch.ansatz.basis import Chebyshev
 from ponn_torch.numerics.piecewise import approximate
+from ponn_torch.optimal_control.control_laws import Unconstrained
 from ponn_torch.optimal_control.curve import Curve
+from ponn_torch.optimal_control.pontryagin import pontryagin
+from ponn_torch.optimal_control.problem import FreeTime, OptimalControlProblem
+from ponn_torch.optimal_control.regularisers import Entropy, Quadratic
 from ponn_torch.solving.certificate import Certificate, Tolerances, certify
-from ponn_torch.solving.flight import fly
+from ponn_torch.solving.checks import end_errors
+from ponn_torch.solving.flight import control_history, fly, fly_extremal
 from ponn_torch.solving.solution import Solution
 
 SOLVED = {
@@ -45,6 +52,36 @@ def disturbed(solution: Solution, size: float, seed: int = 0) -> Solution:
     xi = solution.curve.xi
     noise = torch.randn(xi.shape, generator=generator, dtype=xi.dtype)
     return Solution(Curve(solution.curve.collocation, xi + size * noise))
+
+
+def posed_as(solution: Solution, problem: OptimalControlProblem) -> Solution:
+    """The same curve, claimed to solve another problem with the same dynamics."""
+    made, unknowns = solution.curve.collocation, solution.curve.unknowns
+    other = replace(made, discretisation=replace(made.discretisation, bvp=pontryagin(problem)))
+    return Solution(Curve(other, other.pack(unknowns)))
+
+
+def with_weights_moved(solution: Solution, size: float) -> Solution:
+    """Another curve between the same knots."""
+    made = solution.curve.collocation
+    xi = solution.curve.xi.clone()
+    xi[: made.n_weights] += size
+    return Solution(Curve(made, xi))
+
+
+def with_start_moved(solution: Solution, component: int, size: float) -> Solution:
+    """Another curve, which begins elsewhere and ends where it did."""
+    made, knots = solution.curve.collocation, solution.curve.unknowns.knots.clone()
+    knots[0, component] += size
+    known = torch.where(made.known_knots.isnan(), torch.nan, knots)
+    made = replace(made, known_knots=known)
+    return Solution(Curve(made, made.pack(replace(solution.curve.unknowns, knots=knots))))
+
+
+def fault_names(certificate: Certificate) -> set[str]:
+    """What a verdict objects to, without the numbers."""
+    faults = [] if certificate.certified else certificate.verdict.removeprefix("NOT certified: ").split("; ")
+    return {re.split(r" \S+ exceeds | = ", fault)[0] for fault in faults}
 
 
 # -- what is right --------------------------------------------------------------------------------------
@@ -148,7 +185,8 @@ def test_the_trajectory_with_costates_of_the_other_sign_is_refused():
     assert certificate.end_error_scaled < 1e-12
     assert certificate.off_node_residual < 1e-12
     assert certificate.sign_violation == pytest.approx(float(right(0.0).switching))
-    assert certificate.free_time == pytest.approx(2.0)  # H = 1 − λᵀf in place of 1 + λᵀf = 0
+    # H = 1 − λᵀf = 2 in place of 1 + λᵀf = 0
+    assert certificate.free_time == pytest.approx(1.0)
     assert not certificate.certified
 
 
@@ -193,6 +231,230 @@ def test_tolerances_decide_and_are_checked(smoothed_landing):
     assert "1e-17" in certificate.verdict
     with pytest.raises(ValueError, match="end_error = 0"):
         Tolerances(end_error=0.0)
+
+
+# -- one check at a time --------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Overdone(Unconstrained):
+    """A law that takes a multiple of the minimiser."""
+
+    factor: float = 1.1
+
+    def minimise(self, h, p, like, regime):
+        best = super().minimise(h, p, like, regime)
+        return best._replace(control={self.name: self.factor * best.control[self.name]})
+
+
+@dataclass(frozen=True)
+class Stationed(Unconstrained):
+    """A law that takes ∂H/∂u = 0 for the minimum, whatever H_uu is."""
+
+    def adapted(self, h, cost, p, one, unit):
+        return self
+
+
+def fixed_end(value: float = 0.0) -> OptimalControlProblem:
+    return replace(growing_cost(), final={"x": value}, known_cost=None)
+
+
+def of_radius(square: float) -> OptimalControlProblem:
+    circle = onto_circle()
+    return replace(circle, terminal_manifold=lambda t, x, p: (x.x**2).sum(-1, keepdim=True) - square)
+
+
+def energy(**changes) -> Solution:
+    return solve(replace(minimum_energy(), **changes), [[0.0, 0, 0, 0], [1.0, 0, 0, 0]])
+
+
+def repelled() -> Solution:
+    return SOLVED["unstable"]()
+
+
+def growing(problem: OptimalControlProblem | None = None) -> Solution:
+    return solve(problem or growing_cost(), [[0.0, 0], [0.0, 0]])
+
+
+def soft(stiffness: float) -> Solution:
+    return solve(soft_end(stiffness=stiffness), [[1.0, 0], [1.0, 0]])
+
+
+def circular() -> Solution:
+    return SOLVED["onto_circle"]()
+
+
+def concave(sign: float) -> OptimalControlProblem:
+    """H = ± ½u² + λv stationary where u = ∓ λ; the curve of the other sign has the other costates."""
+    cost = replace(minimum_energy(), known_cost=None, running_cost=lambda t, x, u, p: 0.5 * sign * u.u**2)
+    return replace(cost, control=Stationed("u", 1))
+
+
+def weighted(weight: float) -> OptimalControlProblem:
+    changes = {"running_cost": lambda t, x, u, p: p.weight * u.u**2, "parameters": {"weight": weight}}
+    return replace(minimum_energy(), known_cost=None, **changes)
+
+
+def energetic(weight: float) -> Solution:
+    return solve(weighted(weight), [[0.0, 0, 0, 0], [1.0, 0, 0, 0]])
+
+
+def endless(t, x, p):
+    return torch.where(x.x > -1e9, torch.inf, x.x)
+
+
+WIDE = Tolerances(off_node_residual=math.inf, minimality=math.inf)
+LOOSE = Tolerances(*[math.inf] * 3, transversality=math.inf, minimality=math.inf)  # but for the sign of S
+# what is wrong → (right, wrong, all that the verdict has to object to, tolerances)
+WRONG: dict[str, tuple[Callable[[], Solution], Callable[[], Solution], set[str], Tolerances]] = {
+    "another start": (growing, lambda: with_start_moved(growing(), 0, 1e-3), {"end error scaled"}, WIDE),
+    "another end": (
+        energy,
+        lambda: posed_as(energy(final={"x": 1.001, "v": 0.0}), minimum_energy()),
+        {"end error scaled", "control end error scaled"},
+        Tolerances(),
+    ),
+    "an end off the manifold": (
+        circular,
+        lambda: posed_as(circular(), of_radius(1.01)),
+        {"end error scaled"},
+        Tolerances(),
+    ),
+    "a perturbed control": (
+        repelled,
+        lambda: with_weights_moved(repelled(), 1e-3),
+        {"control end error scaled"},
+        WIDE,
+    ),
+    "another curve between the nodes": (
+        growing,
+        lambda: with_weights_moved(growing(), 1e-3),
+        {"off node residual"},
+        Tolerances(),
+    ),
+    "a free state with a costate": (
+        lambda: growing(fixed_end()),
+        lambda: posed_as(growing(fixed_end()), growing_cost()),
+        {"transversality"},
+        Tolerances(),
+    ),
+    "a costate of another terminal cost": (
+        lambda: soft(2.0),
+        lambda: posed_as(soft(2.0), soft_end(stiffness=3.0)),
+        {"transversality"},
+        Tolerances(),
+    ),
+    "a duration that is not the best": (
+        energy,
+        lambda: posed_as(energy(), replace(minimum_energy(), final_time=FreeTime(1.0))),
+        {"free time"},
+        Tolerances(),
+    ),
+    "too much control": (
+        lambda: energy(control=Overdone("u", 1, 1.0)),
+        lambda: energy(control=Overdone("u", 1)),
+        {"hamiltonian drift"},
+        WIDE,
+    ),
+    "the largest H": (
+        lambda: solve(concave(1.0), [[0.0, 0, 0, 0], [1.0, 0, 0, 0]]),
+        lambda: solve(concave(-1.0), [[0.0, 0, 0, 0], [1.0, 0, 0, 0]]),
+        {"minimality"},
+        Tolerances(),
+    ),
+    "an arc of the other control": (
+        solve_minimum_time,
+        lambda: with_codes(solve_minimum_time(), [2, 2]),
+        {"sign violation"},
+        LOOSE,
+    ),
+    "another duration than stated": (
+        lambda: energy(final_time=1.1, known_cost=None),
+        lambda: posed_as(energy(final_time=1.1), minimum_energy()),
+        {"final_time"},
+        Tolerances(),
+    ),
+    "another parameter than stated": (
+        lambda: energetic(0.6),
+        lambda: posed_as(energetic(0.6), weighted(0.5)),
+        {"weight"},
+        Tolerances(),
+    ),
+    "an endless cost": (
+        energy,
+        lambda: posed_as(energy(), replace(minimum_energy(), terminal_cost=endless)),
+        {"the cost is not finite"},
+        Tolerances(),
+    ),
+}
+
+
+@pytest.mark.parametrize("name", WRONG)
+def test_every_check_tells_what_is_wrong_in_its_way_alone(name):
+    right, wrong, expected, tolerances = WRONG[name]
+    assert certify(right()).certified
+    certificate = certify(wrong(), tolerances)
+    assert fault_names(certificate) == expected, certificate.to_text()
+
+
+def test_jumps_at_restarts_count_as_end_errors():
+    solution = energy()
+    flight = fly_extremal(solution, control_history(solution), explicit_time=False)
+    assert end_errors(solution, flight)[0] < 1e-12
+    assert end_errors(solution, replace(flight, jumps=(1e-16, 1e-3)))[0] == 1e-3
+
+
+def test_a_flight_that_does_not_arrive_says_so():
+    """ẋ = x³ + u leaves every bound before the end once it starts beyond it."""
+    cubic = replace(growing_cost(), dynamics=lambda t, x, u, p: {"x": x.x**3 + u.u}, known_cost=None)
+    right = growing(cubic)
+    certificate = certify(with_start_moved(right, 0, 10.0), Tolerances(*[math.inf] * 6))
+    assert not certificate.certified
+    assert "the flight ended at 0.0" in certificate.verdict
+
+
+@pytest.mark.parametrize("size", [1e-10, 1e-5, 1e5])
+def test_the_size_of_the_cost_does_not_matter(size):
+    """A cost of 1e-10 leaves costates of 1e-10, and what is wrong with them is as wrong."""
+
+    def costing(problem: OptimalControlProblem, size: float) -> OptimalControlProblem:
+        cost = problem.running_cost
+        return replace(problem, running_cost=lambda t, x, u, p: size * cost(t, x, u, p), known_cost=None)
+
+    def measured(size: float) -> list[float]:
+        free = replace(minimum_energy(), final_time=FreeTime(1.0))
+        fixed = solve(costing(minimum_energy(), size), [[0.0, 0, 0, 0], [1.0, 0, 0, 0]])
+        ended = growing(costing(fixed_end(), size))
+        timed = certify(posed_as(fixed, costing(free, size)))
+        loose = certify(posed_as(ended, costing(growing_cost(), size)))
+        assert "free time" in fault_names(timed)
+        assert "transversality" in fault_names(loose)
+        return [timed.free_time, loose.transversality]
+
+    assert measured(size) == pytest.approx(measured(1.0))
+
+
+@dataclass(frozen=True)
+class Mixed:
+    """The law of one regulariser and the penalty of another."""
+
+    fraction = staticmethod(Entropy().fraction)
+    penalty = staticmethod(Quadratic().penalty)
+
+
+def test_a_smoothed_law_minimises_h_with_its_own_penalty(smoothed_landing):
+    assert certify(smoothed_landing).minimality < 1e-14
+    made = smoothed_landing.curve.collocation
+    bvp = replace(made.bvp, law=replace(made.bvp.law, regulariser=Mixed()))
+    other = replace(made, discretisation=replace(made.discretisation, bvp=bvp))
+    assert "minimality" in fault_names(certify(Solution(Curve(other, smoothed_landing.curve.xi))))
+
+
+def test_values_that_are_rounded_to_single_precision_are_as_stated():
+    made = solve(weighted(0.1), [[0.0, 0, 0, 0], [1.0, 0, 0, 0]], dtype=torch.float32, tolerance=1e-4)
+    assert made.curve.collocation.departures() == {}
+    changed = made.curve.collocation.with_setting(weight=0.2, final_time=2.0)
+    assert changed.departures() == {"weight": (pytest.approx(0.2), 0.1), "final_time": (2.0, 1.0)}
 
 
 # -- the record -----------------------------------------------------------------------------------------

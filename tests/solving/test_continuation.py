@@ -143,6 +143,13 @@ def test_giving_up_ends_all_phases_and_unchanged_only_its_own():
     assert values(phases, scripted(Outcome.UNCHANGED)) == [1.0, 0.01, 0.001]
 
 
+def test_legible_ends_its_own_phase_only():
+    phases = Phases((Ladder((1.0, 0.1, 0.01)), Ladder((45.0, 46.0), parameter="final_time")))
+    assert values(phases, scripted(Outcome.SOLVED, Outcome.LEGIBLE)) == [1.0, 0.1, 45.0, 46.0]
+    nested = Phases((phases, Ladder((0.5,))))
+    assert values(nested, scripted(Outcome.SOLVED, Outcome.ABORT)) == [1.0, 0.1]
+
+
 # -- errors --------------------------------------------------------------------------------------------------
 
 

@@ -22,7 +22,7 @@ from ponn_torch.optimal_control.problem import FreeTime, OptimalControlProblem
 from ponn_torch.problems.boundary_layer import boundary_layer, exact_cost
 from ponn_torch.problems.earth_mars import EARTH_VENUS
 from ponn_torch.solving.certificate import certify
-from ponn_torch.solving.continuation import Adaptive, Ladder, Single
+from ponn_torch.solving.continuation import Adaptive, Ladder, Phases, Single
 from ponn_torch.solving.guess import RandomGuess, project
 from ponn_torch.solving.observer import Observer
 from ponn_torch.solving.paths import PolarTransfer
@@ -474,6 +474,24 @@ def test_a_ladder_in_another_parameter_than_the_smoothing_leads_to_the_optimum()
     result = Solver(continuation=ladder, n_starts=1).solve(problem("mars_landing"))
     assert result.certified
     assert result.solution.cost == pytest.approx(268.0146563274, abs=1e-7)
+
+
+def test_a_ladder_that_ends_elsewhere_is_finished_at_the_stated_value():
+    schedule = Phases([Ladder((1.0, 0.3)), Ladder((45.5, 46.0), parameter="final_time")])
+    result = Solver(continuation=schedule, n_starts=1).solve(problem("mars_landing"))
+    assert result.certified
+    assert result.solution.final_time == 44.823
+    assert result.solution.cost == pytest.approx(268.0146563274, abs=1e-7)
+    times = [stage.solution.final_time for stage in result.stages if stage.name == "smooth"]
+    assert times == pytest.approx([44.823, 44.823, 45.5, 46.0, 44.823])
+
+
+def test_a_stated_value_that_is_not_reached_is_said():
+    """Nobody lands in 10 s; a certificate of 46 s is none of this problem."""
+    hasty = problem("mars_landing").with_boundary(final_time=10.0)
+    result = Solver(continuation=Ladder((46.0,), parameter="final_time"), n_starts=1).solve(hasty)
+    assert result.certificate is None
+    assert result.message == "the continuation does not reach the problem as stated from final_time = 46, stated 10"
 
 
 def test_a_seed_is_reproduced_bit_by_bit():
