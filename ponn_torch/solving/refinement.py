@@ -109,7 +109,6 @@ class Segmentation:
     def discretisation(self, bvp: BoundaryValueProblem) -> Discretisation:
         nodes = make_nodes("legendre_gauss", self.n_nodes, dtype=bvp.unit.dtype, device=bvp.unit.device)
         basis = self.basis if isinstance(self.basis, FreeFunction) else self.basis(self.n_neurons)
-        basis = basis.to(dtype=bvp.unit.dtype, device=bvp.unit.device)
         return discretise(bvp, basis, nodes, Strong(), "orthonormal")
 
     def solve(

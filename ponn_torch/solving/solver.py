@@ -113,5 +113,4 @@ class Solver:
     def discretisation(self, bvp: BoundaryValueProblem, form: Form | None = None) -> Discretisation:
         like = bvp.unit
         nodes = make_nodes(self.node_kind, self.n_nodes, dtype=like.dtype, device=like.device)
-        basis = self.basis.to(dtype=like.dtype, device=like.device)
-        return discretise(bvp, basis, nodes, form or self.form, self.conditioning)
+        return discretise(bvp, self.basis, nodes, form or self.form, self.conditioning)
