@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from enum import Enum
 from typing import TYPE_CHECKING, Any, Protocol, cast
@@ -165,6 +165,18 @@ class Stop(Exception):
     def __init__(self, status: Status) -> None:
         super().__init__(status.value)
         self.status = status
+
+
+def replayed(records: Iterable[Record], tell: Callable[[Record], None]) -> Status | None:
+    """Tell of iterations that were done before; a status where that ends the run."""
+    try:
+        for entry in records:
+            tell(entry)
+    except KeyboardInterrupt:
+        return Status.INTERRUPTED
+    except Stop as stop:
+        return stop.status
+    return None
 
 
 class Stopwatch:

@@ -13,7 +13,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from ponn_torch.optim.base import Callback, Optimizer, OptimizeResult, Residual, Status
+from ponn_torch.optim.base import Callback, Optimizer, OptimizeResult, Residual, Status, replayed
 from ponn_torch.optim.checkpoint import (
     Arrays,
     CheckpointFile,
@@ -47,16 +47,16 @@ class Journal:
         on_iteration: Callback | None = None,
         spend: Callable[[float], None] = lambda seconds: None,
     ) -> OptimizeResult:
-        """What ``optimizer.run`` gives, or gave; ``spend`` is told of CPU seconds that an earlier process took."""
+        """What ``optimizer.run`` gives, or gave; ``spend`` is told of CPU seconds that an earlier process took.
+
+        Where the callback ends the run while it is told of what was done before, the status says so.
+        """
         finished, under_way = (self.folder / f"{self._count:03d}{suffix}.npz" for suffix in ("", "_under_way"))
         self._count += 1
         if self._replaying and finished.is_file():
             result = _unpack(read(finished), xi)
             spend(result.cpu_seconds)
-            r = residual.residual(result.xi)
-            for entry in result.records if on_iteration is not None else ():
-                on_iteration(entry, result.xi, r)  # type: ignore[misc]
-            return result
+            return result if on_iteration is None else _told_of(result, residual, on_iteration)
         checkpoint = CheckpointFile(under_way, resume=self._replaying and under_way.is_file(), seconds=self._seconds)
         self._replaying = False
         if checkpoint.saved is not None:
@@ -67,6 +67,13 @@ class Journal:
             write(finished, _pack(result))
             under_way.unlink(missing_ok=True)
         return result
+
+
+def _told_of(result: OptimizeResult, residual: Residual, on_iteration: Callback) -> OptimizeResult:
+    """A finished result, once its callback was told of its iterations."""
+    r = residual.residual(result.xi)
+    cut = replayed(result.records, lambda entry: on_iteration(entry, result.xi, r))
+    return result if cut is None else replace(result, status=cut)
 
 
 def _pack(result: OptimizeResult) -> Arrays:

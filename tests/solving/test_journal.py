@@ -1,5 +1,7 @@
 """A journal gives a solve back what it had computed; with nothing in it, resuming is an error."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 from helpers import problem
@@ -61,6 +63,15 @@ def test_what_was_finished_is_not_computed_again(tmp_path):
 class Anything:
     def residual(self, xi):
         return xi
+
+
+def test_a_budget_that_is_spent_by_what_was_finished_ends_the_solve(tmp_path):
+    SMALL.solve(problem("mars_landing"), 0, Watching(14), Journal(tmp_path))
+    result = replace(SMALL, cpu_seconds=1e-9).solve(problem("mars_landing"), 0, None, Journal(tmp_path, resume=True))
+    assert result.spent
+    assert [stage.status for stage in result.stages] == [Status.BUDGET]
+    assert result.solution is not None
+    assert "CPU time" in result.message
 
 
 def test_a_resume_that_finds_nothing_is_an_error(tmp_path):
