@@ -21,6 +21,7 @@ from ponn_torch.optimal_control.pontryagin import pontryagin
 from ponn_torch.optimal_control.problem import OptimalControlProblem
 from ponn_torch.problems.boundary_layer import boundary_layer, exact_cost
 from ponn_torch.problems.earth_mars import EARTH_VENUS
+from ponn_torch.solving import split
 from ponn_torch.solving.certificate import certify
 from ponn_torch.solving.continuation import Adaptive, Ladder, Single
 from ponn_torch.solving.guess import RandomGuess, project
@@ -30,6 +31,7 @@ from ponn_torch.solving.refinement import Subdivide
 from ponn_torch.solving.result import SolveResult
 from ponn_torch.solving.solution import Solution
 from ponn_torch.solving.solver import Solver
+from ponn_torch.solving.split import Split
 
 DAY = 86400.0
 AU, SUN_GM = 149.59787e9, 1.32712440018e20
@@ -511,6 +513,51 @@ def test_an_interrupted_solve_keeps_what_it_had(stage):
     assert result.stages[-1].status is Status.INTERRUPTED
     assert result.stages[-1].n_iterations == 2
     assert result.solution is observer.reported is not None
+
+
+def test_an_interrupted_solve_keeps_its_best_stage():
+    """Not the one that was cut, as long as that is worse than the one before."""
+    solver = Solver(continuation=Ladder((1.0, 0.1)))
+    result = solver.solve(problem("earth_mars"), 0, Interrupting("smooth", 0.1))
+    first, cut = result.stages
+    assert cut.status is Status.INTERRUPTED
+    assert cut.norm > first.norm
+    assert result.solution is first.solution
+
+
+def test_an_interrupt_between_the_rounds_of_a_refinement_keeps_them(monkeypatch):
+    def interrupt(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(split, "needles", interrupt)
+    result = Solver().solve(problem("mars_landing"))
+    assert result.interrupted
+    assert result.stages[-1].name == "split"
+    assert result.stages[-1].norm < Split().residual_tolerance
+    assert result.solution is result.stages[-1].solution
+    assert result.solution.kind == "split"
+
+
+@pytest.mark.parametrize("refinement", [Split(), Subdivide()])
+def test_a_residual_that_is_not_finite_between_the_nodes_fails_the_refinement(refinement):
+    def dynamics(t, x, u, p):  # of no real number within a millisecond of t = 1 s
+        return {"r": x.v, "v": u.a + 1e-3 * x.r * torch.sqrt((t - 1.0) ** 2 - 1e-6)}
+
+    made = OptimalControlProblem(
+        name="gap",
+        states={"r": 1, "v": 1},
+        control=Unconstrained("a", 1),
+        dynamics=dynamics,
+        running_cost=lambda t, x, u, p: u.a**2,
+        initial={"r": 0.0, "v": 0.0},
+        final={"r": 1.0, "v": 0.0},
+        final_time=2.0,
+    )
+    result = Solver(n_starts=1, refinement=refinement).solve(made)
+    assert not result.certified
+    assert "the residual did not fall below its tolerance" in result.message
+    assert Status.NON_FINITE in [stage.status for stage in result.stages]
+    assert result.solution is not None
 
 
 @pytest.mark.parametrize(("reads", "stages"), [(1, 1), (80, 3)])
