@@ -6,7 +6,8 @@ under way goes on from its checkpoint, and what lies between them is computed an
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import json
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
 
@@ -25,9 +26,15 @@ from ponn_torch.optim.checkpoint import (
     write,
 )
 
+BELONGS = "belongs_to.json"
+
+
+class ForeignJournal(ValueError):
+    """A journal that was kept for another solve."""
+
 
 class Journal:
-    """One file per finished call in a folder, and the checkpoint of the one under way.
+    """One file per finished call in a folder, the checkpoint of the one under way, and what solve they belong to.
 
     Raises:
         FileNotFoundError: ``resume`` with nothing in the folder.
@@ -38,6 +45,25 @@ class Journal:
         self._count = 0
         if resume and not any(folder.glob("*.npz")):
             raise FileNotFoundError(f"nothing to resume: no checkpoint in {str(folder)!r}")
+
+    def belongs_to(self, solve: Mapping[str, str]) -> None:
+        """Keep the digests of all that a solve is determined by, or hold them against those that were kept.
+
+        Raises:
+            ForeignJournal: to go on with another solve; the message names what differs.
+        """
+        path = self.folder / BELONGS
+        if self._replaying:
+            before = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
+            others = [name for name, digest in solve.items() if before.get(name) != digest]
+            if others:
+                raise ForeignJournal(
+                    f"{str(self.folder)!r} holds a solve with other values of {', '.join(others)}; "
+                    "allowed: to go on with the same problem, seed and settings, but for the budget"
+                )
+        else:
+            self.folder.mkdir(parents=True, exist_ok=True)
+            path.write_text(json.dumps(dict(solve), indent=2) + "\n", encoding="utf-8")
 
     def run(
         self,

@@ -72,6 +72,8 @@ class Run:
         self.refused: list[Tensor] = []  # where smoothed solutions began whose refinement failed
         self.note = ""
         self.clock, self.journal = Budget(solver.cpu_seconds), journal
+        if journal is not None:
+            journal.belongs_to(solver.determined_by(problem, seed))
         self.measurements = None if solver.data is None else solver.data.of(problem)
 
     # -- the line ------------------------------------------------------------------------------------------------------

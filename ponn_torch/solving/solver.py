@@ -7,7 +7,7 @@ start that fails is recognised early and the next one is tried; whatever was com
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 
 import torch
 
@@ -17,6 +17,7 @@ from ponn_torch.optim.base import Optimizer, Stopping
 from ponn_torch.optim.least_squares import LevenbergMarquardt
 from ponn_torch.optimal_control.boundary_value_problem import BoundaryValueProblem
 from ponn_torch.optimal_control.discretisation import Discretisation, Form, Strong, discretise
+from ponn_torch.optimal_control.fingerprint import fingerprint
 from ponn_torch.optimal_control.measurements import MeasurementFile, Measurements
 from ponn_torch.optimal_control.problem import OptimalControlProblem
 from ponn_torch.solving.certificate import Tolerances
@@ -107,8 +108,18 @@ class Solver:
         """Solve from random starts of ``seed``; the result's message says what happened, it does not raise.
 
         A ``journal`` keeps what the smoothed stages computed, or gives it back.
+
+        Raises:
+            ForeignJournal: a journal of another solve, before anything is computed.
         """
         return Run(self, problem, seed, observer or SilentObserver(), journal).result()
+
+    def determined_by(self, problem: OptimalControlProblem, seed: int) -> dict[str, str]:
+        """A digest of everything that a solve's result depends on, by name: all but the budget."""
+        basis = [type(self.basis), self.basis.arguments, self.basis.state_dict()]
+        settings = {item.name: getattr(self, item.name) for item in fields(self) if item.name != "cpu_seconds"}
+        values = {"problem": problem, "seed": seed, **settings, "basis": basis}
+        return {name: fingerprint(value) for name, value in values.items()}
 
     def discretisation(self, bvp: BoundaryValueProblem, form: Form | None = None) -> Discretisation:
         like = bvp.unit
