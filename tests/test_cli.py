@@ -96,6 +96,7 @@ def events_in(folder: Path) -> list[str]:
         ("ansatz.conditioning=colums", ["ansatz.conditioning = 'colums'", "'columns'"]),
         ("mass_variable=logmass", ["mass_variable = 'logmass'", "delta_v", "'log_mass'"]),
         ("optimizer.linear_solver=chol", ["optimizer.linear_solver = 'chol'", "qr", "'cholesky'"]),
+        ("dtype=float32", ["dtype = float32 with refinement = Split", "float64"]),
         ("dtype=float16", ["dtype = 'float16'", "'float64'"]),
         ("budget.cpu_seconds=0", ["budget.cpu_seconds = 0", "positive"]),
         ("budget.seconds=3", ["budget.seconds", "cpu_seconds"]),

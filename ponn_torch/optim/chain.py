@@ -9,7 +9,19 @@ from typing import cast
 import torch
 from torch import Tensor
 
-from ponn_torch.optim.base import Callback, Optimizer, OptimizeResult, Record, Residual, Status, Stop, replayed
+from ponn_torch.optim.base import (
+    Around,
+    Callback,
+    Optimizer,
+    OptimizeResult,
+    Record,
+    Residual,
+    Status,
+    Stop,
+    loosened,
+    replayed,
+    warm,
+)
 from ponn_torch.optim.checkpoint import Arrays, Checkpoint, Nested, pack_records, under, unpack_records, within
 from ponn_torch.optim.least_squares import GaussNewton
 from ponn_torch.optim.restricted import Layered, output_layer
@@ -29,6 +41,12 @@ class Chain:
     def __post_init__(self) -> None:
         if not self.parts:
             raise ValueError("parts = []; allowed: at least one optimiser")
+
+    def loosened(self, tolerance: float) -> Chain:
+        return Chain([loosened(part, tolerance) for part in self.parts])
+
+    def warm(self, damping: float) -> Chain:
+        return Chain([warm(part, damping) for part in self.parts])
 
     def run(
         self,
@@ -54,7 +72,7 @@ class Chain:
 
 
 @dataclass(frozen=True)
-class OutputLayer:
+class OutputLayer(Around):
     """Run an optimiser on all unknowns but the hidden weights, which stay as they are."""
 
     optimizer: Optimizer = field(default_factory=GaussNewton)

@@ -20,6 +20,7 @@ from ponn_torch.optim.base import (
     OptimizeResult,
     Record,
     Residual,
+    Ruled,
     Status,
     Stop,
     Stopping,
@@ -311,7 +312,7 @@ def restored(cls: type[Any], arrays: Arrays, like: Tensor) -> Any:
     return unpack(cls, arrays, like.device)
 
 
-class Driven:
+class Driven(Ruled):
     """What makes a method an optimiser."""
 
     def check(self, xi: Tensor) -> None:

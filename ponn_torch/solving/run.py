@@ -102,8 +102,8 @@ class Run:
                     best, message = (candidate, judged), note or judged.verdict
                     verdict = message
                 # a start that came through its stages is the answer where nothing aims at a certificate
-                enough = n_certified if self.solver.exact else 1
-                if enough >= self.solver.n_certified or self.clock.spent:
+                enough = n_certified >= self.solver.n_certified or not self.solver.exact
+                if enough or self.clock.spent:
                     break
         except (_Interrupted, KeyboardInterrupt):
             interrupted, message = True, "interrupted; the best stage so far is kept"

@@ -57,6 +57,7 @@ class Solver:
         trust: a stage is kept while its off-node residual is below this fraction of the largest rate; below the
             resolution of the nodes the residual between them gives a broken stage away.
         data: measurements that join the smoothed stages' residual; a refinement solves the problem as stated.
+        dtype: float64, or float32 where no refinement is to be certified.
         cpu_seconds: budget of the whole solve, certificates apart; what there is when it is spent is kept.
     """
 
@@ -90,6 +91,11 @@ class Solver:
                 raise ValueError(f"{name} = {value}; allowed: at least 1")
         if not self.warm_damping >= 0:
             raise ValueError(f"warm_damping = {self.warm_damping}; allowed: a number ≥ 0")
+        if self.dtype != torch.float64 and self.exact:  # whose rounds end far below the round-off of float32
+            asked = (
+                f"dtype = {str(self.dtype).removeprefix('torch.')} with refinement = {type(self.refinement).__name__}"
+            )
+            raise ValueError(f"{asked}; allowed: float64, or float32 with refinement = None")
         if not self.cpu_seconds > 0:
             raise ValueError(f"cpu_seconds = {self.cpu_seconds}; allowed: a positive number")
 

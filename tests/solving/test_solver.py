@@ -14,7 +14,9 @@ from helpers import PROBLEMS, PROBLEMS_WITH_ANSWERS, bvp_of, collocation, mass_v
 
 from ponn_torch.ansatz.basis import Chebyshev, Legendre, RandomFeatures
 from ponn_torch.optim.base import Status, Stopping
+from ponn_torch.optim.chain import Chain, OutputLayer
 from ponn_torch.optim.least_squares import LevenbergMarquardt
+from ponn_torch.optim.weighted import WeightedEquations
 from ponn_torch.optimal_control.control_laws import Unconstrained
 from ponn_torch.optimal_control.curve import Curve
 from ponn_torch.optimal_control.pontryagin import pontryagin
@@ -617,10 +619,32 @@ def test_a_problem_of_ones_own_takes_a_few_lines():
     assert len(pontryagin(swing).chains) == 2  # angle and rate, and their costates
 
 
-def test_stages_that_lead_to_a_split_end_early_and_others_do_not():
+def test_single_precision_is_for_what_is_not_certified():
+    for refinement in (Split(), Subdivide()):
+        name = type(refinement).__name__
+        with pytest.raises(ValueError, match=f"dtype = float32 with refinement = {name}; allowed: float64, or float32"):
+            Solver(refinement=refinement, dtype=torch.float32)
+    result = Solver(refinement=None, dtype=torch.float32, n_starts=1).solve(problem("minimum_energy"))
+    assert result.solution.curve.xi.dtype is torch.float32
+
+
+def test_where_nothing_aims_at_a_certificate_one_start_is_enough():
+    solver = Solver(continuation=Single(1.0), refinement=None, n_certified=3)
+    assert solver.solve(problem("mars_landing")).n_starts == 1
+
+
+OPTIMIZER = Solver().optimizer
+
+
+@pytest.mark.parametrize(
+    "optimizer",
+    [OPTIMIZER, WeightedEquations(OPTIMIZER, {"v_1": 2.0}), Chain([OPTIMIZER, OutputLayer()])],
+    ids=["alone", "weighted", "in a chain"],
+)
+def test_stages_that_lead_to_a_split_end_early_and_others_do_not(optimizer):
     fuel = problem("mars_landing")
-    split = Solver(continuation=Single(1.0)).solve(fuel, 0)
-    alone = Solver(continuation=Single(1.0), refinement=None).solve(fuel, 0)
+    split = Solver(continuation=Single(1.0), optimizer=optimizer).solve(fuel, 0)
+    alone = Solver(continuation=Single(1.0), optimizer=optimizer, refinement=None).solve(fuel, 0)
     assert split.certified
     assert 1e-6 < split.stages[0].norm < 1e-4
     assert alone.stages[0].norm < 1e-6
