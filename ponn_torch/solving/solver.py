@@ -92,10 +92,9 @@ class Solver:
         if not self.warm_damping >= 0:
             raise ValueError(f"warm_damping = {self.warm_damping}; allowed: a number ≥ 0")
         if self.dtype != torch.float64 and self.exact:  # whose rounds end far below the round-off of float32
-            asked = (
-                f"dtype = {str(self.dtype).removeprefix('torch.')} with refinement = {type(self.refinement).__name__}"
-            )
-            raise ValueError(f"{asked}; allowed: float64, or float32 with refinement = None")
+            name, refinement = str(self.dtype).removeprefix("torch."), type(self.refinement).__name__
+            allowed = "float64, or float32 with refinement = None"
+            raise ValueError(f"dtype = {name} with refinement = {refinement}; allowed: {allowed}")
         if not self.cpu_seconds > 0:
             raise ValueError(f"cpu_seconds = {self.cpu_seconds}; allowed: a positive number")
 
