@@ -63,6 +63,8 @@ class Journal:
                 )
         else:
             self.folder.mkdir(parents=True, exist_ok=True)
+            for left in self.folder.glob("[0-9][0-9][0-9]*.npz"):  # by an earlier solve
+                left.unlink()
             path.write_text(json.dumps(dict(solve), indent=2) + "\n", encoding="utf-8")
 
     def run(

@@ -79,11 +79,13 @@ MADE = problem("mars_landing")
     ],
 )
 def test_a_journal_goes_on_with_its_own_solve_only(named, other, tmp_path):
-    SMALL.solve(MADE, 0, Watching(2), Journal(tmp_path))
+    SMALL.solve(MADE, 0, Watching(14), Journal(tmp_path))
+    assert (tmp_path / "000.npz").is_file()
     solver, *stated = other
     with pytest.raises(ForeignJournal, match=f"other values of {named};"):
         solver.solve(*stated, None, Journal(tmp_path, resume=True))
     solver.solve(*stated, Watching(2), Journal(tmp_path))  # begun anew, it belongs to that one
+    assert [path.name for path in tmp_path.glob("*.npz")] == ["000_under_way.npz"]
     solver.solve(*stated, Watching(2), Journal(tmp_path, resume=True))
 
 
