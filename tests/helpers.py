@@ -20,8 +20,9 @@ from ponn_torch.numerics.nodes import make_nodes
 from ponn_torch.optim.base import Optimizer, Stopping
 from ponn_torch.optim.chain import Chain
 from ponn_torch.optim.gradient import Adam
-from ponn_torch.optim.least_squares import GaussNewton, LevenbergMarquardt, ScipyLeastSquares
+from ponn_torch.optim.least_squares import GaussNewton, LevenbergMarquardt
 from ponn_torch.optim.quasi_newton import LBFGS, SSBroyden
+from ponn_torch.optim.scipy_least_squares import ScipyLeastSquares
 from ponn_torch.optimal_control.boundary_value_problem import BoundaryValueProblem
 from ponn_torch.optimal_control.collocation import Collocation
 from ponn_torch.optimal_control.discretisation import Discretisation, Form, Strong

@@ -96,6 +96,7 @@ def events_in(folder: Path) -> list[str]:
         ("ansatz.conditioning=colums", ["ansatz.conditioning = 'colums'", "'columns'"]),
         ("mass_variable=logmass", ["mass_variable = 'logmass'", "delta_v", "'log_mass'"]),
         ("optimizer.linear_solver=chol", ["optimizer.linear_solver = 'chol'", "qr", "'cholesky'"]),
+        ("dtype=float32", ["dtype = float32 with refinement = Split", "float64"]),
         ("dtype=float16", ["dtype = 'float16'", "'float64'"]),
         ("budget.cpu_seconds=0", ["budget.cpu_seconds = 0", "positive"]),
         ("budget.seconds=3", ["budget.seconds", "cpu_seconds"]),
@@ -342,6 +343,28 @@ def iterations_in(folder: Path) -> list[dict[str, object]]:
     lines = (folder / "records.jsonl").read_text(encoding="utf-8").splitlines()
     records = [json.loads(line) for line in lines]
     return [{k: v for k, v in record.items() if k != "seconds"} for record in records if record["event"] == "iteration"]
+
+
+def test_a_resume_changes_the_budget_and_the_records_only(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("ponn_torch.optim.base.time.process_time", map(float, itertools.count()).__next__)
+    file = tmp_path / "own.py"
+    file.write_text(OWN_PROBLEM, encoding="utf-8")
+    sizes = ["ansatz.size=12", "nodes.n_nodes=20", "refinement=none", "record=minimal"]
+    folder = tmp_path / "run"
+    main([f"problem={file}:shift", *sizes, "budget.cpu_seconds=3", f"hydra.run.dir='{folder}'"])
+    capsys.readouterr()
+    for override in ("seed=5", "ansatz.size=13", "optimizer=lbfgs", "device=cpu"):
+        assert main([f"resume={folder}", override]) == 1
+        (line,) = capsys.readouterr().err.splitlines()
+        assert line.startswith(f"ponn: {override.partition('=')[0]}: ")
+        assert "allowed: budget.*, record.*" in line
+    file.write_text(OWN_PROBLEM.replace("0.5 *", "0.7 *"), encoding="utf-8")
+    assert main([f"resume={folder}", "budget.cpu_seconds=.inf"]) == 1
+    assert "other values of problem;" in outcome_in(folder)["message"]
+    file.write_text(OWN_PROBLEM, encoding="utf-8")
+    assert main([f"resume={folder}", "budget.cpu_seconds=.inf", "record.figures=false"]) == 0
 
 
 def test_a_resume_that_finds_nothing_is_an_error(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:

@@ -13,7 +13,7 @@ from experiments.solves import PROBLEMS, row
 from experiments.tables import Report, share, spread, worst
 from ponn_torch.ansatz.basis import Chebyshev
 from ponn_torch.optim.base import Optimizer, Stopping
-from ponn_torch.optim.least_squares import ScipyLeastSquares
+from ponn_torch.optim.scipy_least_squares import ScipyLeastSquares
 from ponn_torch.solving.continuation import log_ladder
 from ponn_torch.solving.enrichment import Enrichment
 from ponn_torch.solving.solver import Solver

@@ -19,6 +19,7 @@ from omegaconf.errors import OmegaConfBaseException
 SWITCHES = ("--multirun", "-m", "--resolve", "--info", "--hydra-help", "--shell-completion")
 WITH_VALUE = ("--cfg", "-c", "--package", "-p", "--info", "-i", "--config-dir", "-cd")
 OPEN = ("problem.arguments.", "weights.equations.")  # settings whose names the problem gives
+RESUMABLE = ("budget.", "record.")  # settings that may change where a run goes on
 VALUES = ("job", "hydra", "all", "config", "defaults", "defaults-tree", "plugins", "searchpath")
 
 
@@ -118,7 +119,7 @@ def read(arguments: Sequence[str], application: Application = PONN) -> Command:
 
 
 def _resumed(folder: Path, options: Sequence[str], overrides: Sequence[str]) -> Command:
-    """The command that goes on with a run: its own config, changed where overrides say so."""
+    """The command that goes on with a run: its own config, with another budget or other records if that is asked."""
     if options:
         raise InputError(f"resume = {str(folder)!r} with {' '.join(options)}; allowed: alone, or with KEY=VALUE")
     saved = folder / "config.yaml"
@@ -130,6 +131,9 @@ def _resumed(folder: Path, options: Sequence[str], overrides: Sequence[str]) -> 
     assert isinstance(config, DictConfig)
     for text in overrides:
         key, _, value = text.partition("=")
+        if not key.startswith(RESUMABLE):
+            allowed = ", ".join(f"{place}*" for place in RESUMABLE)
+            raise InputError(f"{key}: a run that goes on keeps its settings; allowed: {allowed}")
         _check_key(config, key, [])
         OmegaConf.update(config, key, OmegaConf.from_dotlist([f"value={value}"]).value)
     return Command([], list(overrides), config, folder)

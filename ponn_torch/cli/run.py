@@ -25,7 +25,7 @@ from ponn_torch.reporting.report import end_error_lines, verdict_table, write_re
 from ponn_torch.reporting.style import number, unit
 from ponn_torch.settings import ConfigError, one_line, users_line
 from ponn_torch.solving.certificate import Certificate
-from ponn_torch.solving.journal import Journal
+from ponn_torch.solving.journal import ForeignJournal, Journal
 from ponn_torch.solving.result import StageResult
 from ponn_torch.solving.solution import Solution
 
@@ -164,8 +164,11 @@ class SolveJob:
         )
         _keep_choices(self._folder, self._choices)
         journal = Journal(self._folder / CHECKPOINTS, resume=self._resume)
-        with recorder:
-            result = plan.solver.solve(plan.problem, plan.seed, recorder, journal)
+        try:
+            with recorder:
+                result = plan.solver.solve(plan.problem, plan.seed, recorder, journal)
+        except ForeignJournal as error:  # a user's problem file that was changed meanwhile, say
+            raise ConfigError(str(error)) from error
         code = DONE if result.certified else NOT_CERTIFIED
         if not plan.solver.exact and result.solution is not None and result.certificate is not None:
             code = DONE  # a smoothed solution was asked for; what it is worth stands in its certificate

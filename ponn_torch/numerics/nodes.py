@@ -167,7 +167,8 @@ def make_panels(kind: str, edges: Tensor, counts: int | Sequence[int]) -> NodeSe
 def graded_edges(centres: Tensor, widths: Tensor, coarsest: float = 0.5) -> Tensor:
     """Edges (P+1,) on [−1, 1] of panels that resolve layers of the given widths (M,) at the centres (M,).
 
-    By halving: next to a layer no panel is longer than its width, elsewhere none than its distance from it.
+    By halving: next to a layer no panel is longer than its width, elsewhere none than its distance from it. Panels
+    between neighbouring numbers stay as they are.
 
     Raises ValueError for a width that is not positive.
     """
@@ -177,10 +178,11 @@ def graded_edges(centres: Tensor, widths: Tensor, coarsest: float = 0.5) -> Tens
     while True:
         start, end = edges[:-1, None], edges[1:, None]
         distance = torch.maximum(start - centres, centres - end).clamp_min(0.0)
-        long = (end - start > torch.maximum(widths, distance)).any(-1)
+        middles = (edges[:-1] + edges[1:]) / 2
+        long = (end - start > torch.maximum(widths, distance)).any(-1) & (edges[:-1] < middles) & (middles < edges[1:])
         if not bool(long.any()):
             return edges
-        edges = torch.cat([edges, ((edges[:-1] + edges[1:]) / 2)[long]]).sort().values
+        edges = torch.cat([edges, middles[long]]).sort().values
 
 
 def barycentric_weights(points: Tensor) -> Tensor:

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from enum import Enum
-from typing import TYPE_CHECKING, Any, Protocol, cast
+from typing import TYPE_CHECKING, Any, Protocol, cast, runtime_checkable
 
 import torch
 from torch import Tensor
@@ -122,21 +122,58 @@ class Optimizer(Protocol):
         ...
 
 
+# -- an optimiser whose result is a start for something else --------------------------------------------------------
+
+
+@runtime_checkable
+class Adjustable(Protocol):
+    """An optimiser that a conductor may ask for less: its stages begin near their solution, or lead to another one."""
+
+    def loosened(self, tolerance: float) -> Optimizer:
+        """The same with no smaller tolerance than this."""
+        ...
+
+    def warm(self, damping: float) -> Optimizer:
+        """The same with no larger first damping than this."""
+        ...
+
+
+class Ruled:
+    """An optimiser with stopping rules of its own; without a damping it is always warm."""
+
+    def loosened(self, tolerance: float) -> Optimizer:
+        made: Any = self
+        if made.stopping.tolerance >= tolerance:
+            return cast(Optimizer, made)
+        return cast(Optimizer, replace(made, stopping=replace(made.stopping, tolerance=tolerance)))
+
+    def warm(self, damping: float) -> Optimizer:
+        return cast(Optimizer, self)
+
+
+class Around:
+    """An optimiser that runs another one, its field ``optimizer``, which is what is adjusted."""
+
+    def loosened(self, tolerance: float) -> Optimizer:
+        made: Any = self
+        return cast(Optimizer, replace(made, optimizer=loosened(made.optimizer, tolerance)))
+
+    def warm(self, damping: float) -> Optimizer:
+        made: Any = self
+        return cast(Optimizer, replace(made, optimizer=warm(made.optimizer, damping)))
+
+
 def loosened(optimizer: Optimizer, tolerance: float) -> Optimizer:
-    """The optimiser with no smaller tolerance than this; one without stopping rules of its own comes back as it is."""
-    made: Any = optimizer
-    rule = getattr(made, "stopping", None)
-    if not isinstance(rule, Stopping) or rule.tolerance >= tolerance:
-        return optimizer
-    return cast(Optimizer, replace(made, stopping=replace(rule, tolerance=tolerance)))
+    """The optimiser with no smaller tolerance than this; one that is not Adjustable comes back as it is."""
+    return optimizer.loosened(tolerance) if isinstance(optimizer, Adjustable) else optimizer
 
 
 def warm(optimizer: Optimizer, damping: float) -> Optimizer:
-    """The optimiser with no larger first damping than this; one without damping comes back as it is."""
-    made: Any = optimizer
-    if not getattr(made, "damping", 0.0) > damping:
-        return optimizer
-    return cast(Optimizer, replace(made, damping=damping))
+    """The optimiser with no larger first damping than this; one that is not Adjustable comes back as it is."""
+    return optimizer.warm(damping) if isinstance(optimizer, Adjustable) else optimizer
+
+
+# -- how a run begins and ends ---------------------------------------------------------------------------------------
 
 
 class NonFiniteResidual(FloatingPointError):
@@ -165,6 +202,18 @@ class Stop(Exception):
     def __init__(self, status: Status) -> None:
         super().__init__(status.value)
         self.status = status
+
+
+def replayed(records: Iterable[Record], tell: Callable[[Record], None]) -> Status | None:
+    """Tell of iterations that were done before; a status where that ends the run."""
+    try:
+        for entry in records:
+            tell(entry)
+    except KeyboardInterrupt:
+        return Status.INTERRUPTED
+    except Stop as stop:
+        return stop.status
+    return None
 
 
 class Stopwatch:

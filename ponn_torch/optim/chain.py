@@ -9,7 +9,19 @@ from typing import cast
 import torch
 from torch import Tensor
 
-from ponn_torch.optim.base import Callback, Optimizer, OptimizeResult, Record, Residual, Status
+from ponn_torch.optim.base import (
+    Around,
+    Callback,
+    Optimizer,
+    OptimizeResult,
+    Record,
+    Residual,
+    Status,
+    Stop,
+    loosened,
+    replayed,
+    warm,
+)
 from ponn_torch.optim.checkpoint import Arrays, Checkpoint, Nested, pack_records, under, unpack_records, within
 from ponn_torch.optim.least_squares import GaussNewton
 from ponn_torch.optim.restricted import Layered, output_layer
@@ -30,6 +42,12 @@ class Chain:
         if not self.parts:
             raise ValueError("parts = []; allowed: at least one optimiser")
 
+    def loosened(self, tolerance: float) -> Chain:
+        return Chain([loosened(part, tolerance) for part in self.parts])
+
+    def warm(self, damping: float) -> Chain:
+        return Chain([warm(part, damping) for part in self.parts])
+
     def run(
         self,
         residual: Residual,
@@ -41,9 +59,8 @@ class Chain:
         first, done, saved = 0, OptimizeResult(xi, xi.new_tensor(torch.inf), Status.INTERRUPTED), None
         if checkpoint is not None and checkpoint.saved is not None:
             first, done, saved = _restore(checkpoint.saved, xi)
-            r = residual.residual(done.xi)
-            for entry in done.records if on_iteration is not None else ():
-                on_iteration(entry, done.xi, r)  # type: ignore[misc]
+            if on_iteration is not None:
+                on_iteration = _told_of(done, residual.residual(done.xi), on_iteration)
         for index in range(first, len(self.parts)):
             nested = None if checkpoint is None else Nested(checkpoint, _pack(index, done), saved)
             told = None if on_iteration is None else _continued(done, on_iteration)
@@ -55,7 +72,7 @@ class Chain:
 
 
 @dataclass(frozen=True)
-class OutputLayer:
+class OutputLayer(Around):
     """Run an optimiser on all unknowns but the hidden weights, which stay as they are."""
 
     optimizer: Optimizer = field(default_factory=GaussNewton)
@@ -87,6 +104,17 @@ class OutputLayer:
 
         result = self.optimizer.run(layer, layer.start, told, inner)
         return replace(result, xi=layer.full(result.xi))
+
+
+def _told_of(done: OptimizeResult, r: Tensor, on_iteration: Callback) -> Callback:
+    """The callback, told of what was done before; where that ends the run, one that ends the next part at once."""
+    cut = replayed(done.records, lambda entry: on_iteration(entry, done.xi, r))
+
+    def end(entry: Record, xi: Tensor, r: Tensor) -> None:
+        assert cut is not None
+        raise Stop(cut)  # the part's own checkpoint may hold a better point than what was done before it
+
+    return on_iteration if cut is None else end
 
 
 def _shifted(done: OptimizeResult, entry: Record) -> Record:

@@ -20,12 +20,14 @@ from ponn_torch.optim.base import (
     OptimizeResult,
     Record,
     Residual,
+    Ruled,
     Status,
     Stop,
     Stopping,
     Stopwatch,
     check_start,
     record,
+    replayed,
 )
 from ponn_torch.optim.checkpoint import (
     Arrays,
@@ -189,33 +191,27 @@ def drive(
         state = method.restore(counted, under("state", saved), xi)
         last = progress.records[-1] if progress.records else {"residuals": 0, "linearisations": 0}
         counted.n_residuals, counted.n_derivatives = int(last["residuals"]), int(last["linearisations"])
-    before, cut = progress.seconds, None
-    untold = list(progress.records) if on_iteration is not None else []  # of a run that goes on
+    before = progress.seconds
+    told = on_iteration or _nobody
 
     def keep() -> None:
         if checkpoint is not None:
             checkpoint.save(within("state", pack(state)) | within("progress", progress.pack()))
 
-    while untold or bool((progress.code == RUNNING).any()):
+    cut = replayed(progress.records, lambda entry: told(entry, progress.xi, progress.r))  # of a run that goes on
+    while cut is None and bool((progress.code == RUNNING).any()):
         try:
-            if untold and on_iteration is not None:
-                on_iteration(untold.pop(0), progress.xi, progress.r)
-                continue
             running = progress.code == RUNNING
             following, move = method.step(counted, state, running)
-            advanced, entry = _advance(progress, following, move, running, rule, counted, before + watch.seconds)
-            progress.records.append(entry)
+            advanced = _advance(progress, following, move, running, rule, counted, before + watch.seconds)
             state, progress = following, advanced
-            if on_iteration is not None:
-                on_iteration(progress.records[-1], progress.xi, progress.r)
+            told(progress.records[-1], progress.xi, progress.r)
             if checkpoint is not None and checkpoint.due():
                 keep()
         except KeyboardInterrupt:
             cut = Status.INTERRUPTED
         except Stop as stop:
             cut = stop.status
-        if cut is not None:
-            break
     if cut is not None or _CODES.index(Status.TIME_LIMIT) in progress.code:
         keep()
     end = cut or Status.INTERRUPTED
@@ -232,6 +228,10 @@ def drive(
     )
 
 
+def _nobody(entry: Record, xi: Tensor, r: Tensor) -> None:
+    """The callback of a run that nobody watches."""
+
+
 def _advance(
     progress: _Progress,
     state: State,
@@ -240,8 +240,8 @@ def _advance(
     rule: Stopping,
     counted: Counted,
     seconds: float,
-) -> tuple[_Progress, Record]:
-    """The progress after one iteration, with whoever ends by it, and the iteration's record."""
+) -> _Progress:
+    """The progress after one iteration, with whoever ends by it, and the iteration's record; the one before stays."""
     cost = state.r.square().sum(-1)
     accepted = running & (cost < progress.cost)  # NaN compares false
     iteration = len(progress.records) + 1
@@ -271,7 +271,7 @@ def _advance(
         linearisations=counted.n_derivatives,
         seconds=seconds,
     )
-    return _Progress(xi, r, best, code, slow, progress.records, seconds), entry
+    return _Progress(xi, r, best, code, slow, [*progress.records, entry], seconds)
 
 
 def _endings(
@@ -312,7 +312,7 @@ def restored(cls: type[Any], arrays: Arrays, like: Tensor) -> Any:
     return unpack(cls, arrays, like.device)
 
 
-class Driven:
+class Driven(Ruled):
     """What makes a method an optimiser."""
 
     def check(self, xi: Tensor) -> None:

@@ -1,4 +1,4 @@
-"""Least squares: linear, Gauss–Newton, Levenberg–Marquardt, and SciPy's solvers behind the same call.
+"""Least squares: linear, Gauss–Newton and Levenberg–Marquardt.
 
 Levenberg–Marquardt carries the batch axis: every member has its own damping, acceptance and status, and members that
 have ended are frozen. A trial step costs one residual; the Jacobian is formed at accepted points only.
@@ -8,24 +8,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 
-import numpy as np
 import torch
-from scipy.optimize import least_squares as scipy_least_squares
 from torch import Tensor
 
 from ponn_torch.numerics.linalg import LINEAR_SOLVERS, Jacobian
-from ponn_torch.optim.base import (
-    Callback,
-    OptimizeResult,
-    Record,
-    Residual,
-    Status,
-    Stop,
-    Stopping,
-    Stopwatch,
-    check_start,
-    record,
-)
+from ponn_torch.optim.base import Callback, OptimizeResult, Residual, Ruled, Status, Stopping
 from ponn_torch.optim.checkpoint import Arrays, Checkpoint
 from ponn_torch.optim.driver import Counted, Driven, Move, restored
 
@@ -116,6 +103,9 @@ class LevenbergMarquardt(Driven):
             raise ValueError(f"damping = {self.damping}; allowed: a number ≥ 0")
         if not 0 <= self.reuse < 1:
             raise ValueError(f"reuse = {self.reuse}; allowed: from 0 to below 1")
+
+    def warm(self, damping: float) -> LevenbergMarquardt:
+        return replace(self, damping=damping) if self.damping > damping else self
 
     def begin(self, residual: Counted, xi: Tensor) -> DampedState:
         r, jacobian = residual.linearise(xi)
@@ -212,7 +202,7 @@ class LevenbergMarquardt(Driven):
 
 
 @dataclass(frozen=True)
-class GaussNewton:
+class GaussNewton(Ruled):
     """Undamped steps J p = −r by QR; ends when the norm rises. For problems that are linear, or nearly so."""
 
     stopping: Stopping = field(default_factory=lambda: Stopping(max_iterations=20))
@@ -232,115 +222,3 @@ class GaussNewton:
             self.stopping, 0.0, linear_solver=self.linear_solver, smallest_damping=0.0, largest_damping=0.0
         )
         return inner.run(residual, xi, on_iteration, checkpoint)
-
-
-# -- SciPy -----------------------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class ScipyLeastSquares:
-    """scipy.optimize.least_squares on the same residual: ``trf`` (the PoNN paper's landing), ``lm`` or ``dogbox``.
-
-    The rules of ``stopping`` are applied here, after every residual that SciPy asks for, so that they mean what they
-    mean elsewhere; of SciPy's own only ``step`` and round-off are left.
-    """
-
-    method: str = "trf"
-    stopping: Stopping = field(default_factory=Stopping)
-
-    def __post_init__(self) -> None:
-        if self.method not in ("trf", "lm", "dogbox"):
-            raise ValueError(f"method = {self.method!r}; allowed: trf, lm, dogbox")
-
-    def run(
-        self,
-        residual: Residual,
-        xi: Tensor,
-        on_iteration: Callback | None = None,
-        checkpoint: Checkpoint | None = None,
-    ) -> OptimizeResult:
-        """Minimise ½‖r(ξ)‖² from ξ (N,); SciPy keeps its state to itself, so there are no checkpoints."""
-        if xi.dim() != 1:
-            raise ValueError(f"xi has shape {tuple(xi.shape)}; scipy solves one problem, shape (N,), at a time")
-        rule, watch = self.stopping, Stopwatch()
-        records: list[Record] = []
-        check_start(residual, residual.residual(xi))
-        count = {"residuals": 0, "linearisations": 0}
-        best: list[tuple[float, Tensor]] = [(float("inf"), xi)]
-        slow = 0
-
-        def tensor(x: np.ndarray) -> Tensor:
-            return torch.as_tensor(x, dtype=xi.dtype, device=xi.device)
-
-        def function(x: np.ndarray) -> np.ndarray:
-            nonlocal slow
-            point = tensor(x.copy())
-            r = residual.residual(point)
-            count["residuals"] += 1
-            norm, before = float(r.norm()), best[0][0]
-            improved = norm < before
-            if not torch.equal(point, best[0][1]):  # SciPy asks for some points twice
-                # as in Levenberg–Marquardt, a rejected step next to the best norm counts, one far off does not
-                near = abs(before**2 - norm**2) < rule.decrease * before**2
-                slow = slow + 1 if near else 0 if improved else slow
-            if improved:
-                best[0] = (norm, point)
-            records.append(
-                record(
-                    iteration=len(records) + 1,
-                    norm=best[0][0],
-                    damping=0.0,
-                    step=0.0,
-                    accepted=improved,
-                    running=1,
-                    residuals=count["residuals"],
-                    linearisations=count["linearisations"],
-                    seconds=watch.seconds,
-                )
-            )
-            if on_iteration is not None:
-                on_iteration(records[-1], best[0][1], r)
-            for condition, status in (
-                (best[0][0] < rule.tolerance and not rule.past_tolerance, Status.RESIDUAL),
-                (before < rule.tolerance and norm > before and rule.past_tolerance, Status.ROUND_OFF),
-                (slow >= rule.patience, Status.SMALL_DECREASE),
-                (best[0][0] > rule.hopeless and len(records) >= rule.hopeless_after, Status.HOPELESS),
-                (watch.seconds > rule.cpu_seconds, Status.TIME_LIMIT),
-            ):
-                if condition:
-                    raise Stop(status)
-            return np.nan_to_num(r.detach().cpu().numpy(), nan=1e150, posinf=1e150, neginf=-1e150)
-
-        def jacobian(x: np.ndarray) -> np.ndarray:
-            count["linearisations"] += 1
-            return residual.linearise(tensor(x.copy()))[1].dense().cpu().numpy()
-
-        try:
-            out = scipy_least_squares(
-                function,
-                xi.cpu().numpy(),
-                jac=jacobian,
-                method=self.method,
-                x_scale="jac",
-                ftol=2.3e-16,
-                xtol=max(rule.step, 2.3e-16),
-                gtol=2.3e-16,
-                max_nfev=rule.max_iterations,
-            )
-            status = {0: Status.MAX_ITERATIONS, 2: Status.SMALL_DECREASE, 3: Status.SMALL_STEP}.get(
-                out.status, Status.SMALL_DECREASE
-            )
-        except Stop as stop:
-            status = stop.status
-        except KeyboardInterrupt:
-            status = Status.INTERRUPTED
-        return OptimizeResult(
-            xi=best[0][1],
-            norm=xi.new_tensor(best[0][0]),
-            status=status,
-            records=records,
-            n_residuals=count["residuals"],
-            n_linearisations=count["linearisations"],
-            cpu_seconds=watch.seconds,
-            member_status=(status,),
-        )

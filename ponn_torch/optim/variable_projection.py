@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from ponn_torch.numerics.linalg import DenseJacobian
-from ponn_torch.optim.base import Callback, Optimizer, OptimizeResult, Record, Residual
+from ponn_torch.optim.base import Around, Callback, Optimizer, OptimizeResult, Record, Residual
 from ponn_torch.optim.checkpoint import Checkpoint, Nested, under
 from ponn_torch.optim.least_squares import GaussNewton, LevenbergMarquardt
 from ponn_torch.optim.restricted import Layered
@@ -120,7 +120,7 @@ class Projected:
 
 
 @dataclass(frozen=True)
-class VariableProjection:
+class VariableProjection(Around):
     """Run an optimiser on the hidden weights with all other unknowns eliminated; see `Projected`.
 
     Its records and rules are those of [r; ridge η], the norm of the result is that of r. Where nothing is hidden, as in

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from ponn_torch.numerics.linalg import Jacobian
-from ponn_torch.optim.base import Callback, Optimizer, OptimizeResult, Residual
+from ponn_torch.optim.base import Around, Callback, Optimizer, OptimizeResult, Residual
 from ponn_torch.optim.checkpoint import Checkpoint
 from ponn_torch.optim.driver import Counted
 from ponn_torch.optim.restricted import Layered
@@ -100,7 +100,7 @@ class Weighted:
 
 
 @dataclass(frozen=True)
-class WeightedEquations:
+class WeightedEquations(Around):
     """Run an optimiser on W r; its records and rules are those of W r, the norm of the result is that of r.
 
     Raises:

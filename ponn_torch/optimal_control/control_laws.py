@@ -399,7 +399,7 @@ class ThrustBall(Bounded):
         return Minimiser(control, self._switching(at_lower, at_upper), fraction)
 
     def samples(self, minimiser: Minimiser, p: Any) -> Minimiser:
-        low, high = self.bounds(p)
+        low, high = self.bounds(p, minimiser.fraction)
         vector, eta = minimiser.control[self.name], minimiser.fraction
         some = vector.abs().amax(-1, keepdim=True) > 0
         own = sampling.unit(torch.where(some, vector, torch.eye(self.size).to(vector)[0]))
@@ -490,6 +490,6 @@ class Box(Bounded):
         return Minimiser({self.name: low + (high - low) * fraction}, self._switching(at_lower, at_upper), fraction)
 
     def samples(self, minimiser: Minimiser, p: Any) -> Minimiser:
-        low, high = self.bounds(p)
+        low, high = self.bounds(p, minimiser.fraction)
         fraction = sampling.fractions(minimiser.fraction)
         return minimiser._replace(control={self.name: low + (high - low) * fraction}, fraction=fraction)

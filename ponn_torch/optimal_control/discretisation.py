@@ -8,10 +8,9 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
-from copy import copy
+from copy import copy, deepcopy
 from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -23,7 +22,7 @@ from ponn_torch.numerics.nodes import NodeSet, legendre_moments
 from ponn_torch.numerics.tape import Replay
 from ponn_torch.optimal_control.boundary_value_problem import BoundaryValueProblem, Chain
 from ponn_torch.optimal_control.deep_expressions import DeepExpressions
-from ponn_torch.optimal_control.expressions import Expressions, LinearExpressions
+from ponn_torch.optimal_control.expressions import Expressions, LinearExpressions, shared
 from ponn_torch.optimal_control.meaning import Keyed
 
 # -- test functions: how the pointwise residual becomes rows ---------------------------------------------------------
@@ -234,18 +233,29 @@ def discretise(
 ) -> Discretisation:
     """Tables and tapes are the same for the same equations and parts: those of one solve serve the next.
 
-    A basis whose weights were changed in place is another one.
+    The free function is taken in the nodes' dtype and on their device, as a copy where it is not there; the caller's
+    is left as it is. One whose weights were changed in place is another one.
     """
-    if isinstance(basis, LinearBasis) and not dict(basis.named_buffers()):
-        basis = _made_once(type(basis), tuple(basis.arguments.items()))
-    weights = tuple((id(x), x._version) for x in (*basis.parameters(), *basis.buffers()))
-    return _discretise(Keyed(bvp.equations, bvp), basis, nodes, form, conditioning, weights).serving(bvp)
+    basis = _placed(shared(basis), _versions(basis), nodes.points.dtype, nodes.points.device)
+    return _discretise(Keyed(bvp.equations, bvp), basis, nodes, form, conditioning, _versions(basis)).serving(bvp)
 
 
-@lru_cache(maxsize=64)
-def _made_once(kind: type[LinearBasis], arguments: tuple[tuple[str, Any], ...]) -> LinearBasis:
-    """A basis that draws nothing: its arguments say all."""
-    return kind(**dict(arguments))
+def _tensors(basis: FreeFunction) -> list[Tensor]:
+    return [*basis.parameters(), *basis.buffers()]
+
+
+def _versions(basis: FreeFunction) -> tuple[tuple[int, int], ...]:
+    """What tells a free function from the same one with its weights changed in place."""
+    return tuple((id(x), x._version) for x in _tensors(basis))
+
+
+@lru_cache(maxsize=32)
+def _placed(
+    basis: FreeFunction, versions: tuple[tuple[int, int], ...], dtype: torch.dtype, device: torch.device
+) -> FreeFunction:
+    """The free function itself where it is in this dtype and on this device, else a copy that is."""
+    there = all(x.device == device and (x.dtype == dtype or not x.is_floating_point()) for x in _tensors(basis))
+    return basis if there else deepcopy(basis).to(dtype=dtype, device=device)
 
 
 @lru_cache(maxsize=32)

@@ -7,20 +7,24 @@ the weights from that with respect to y, and a fit. Linear free functions answer
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from copy import deepcopy
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Protocol, TypeVar, cast
 
 import torch
 from torch import Tensor
 
-from ponn_torch.ansatz.basis import LinearBasis
+from ponn_torch.ansatz.basis import FreeFunction, LinearBasis
 from ponn_torch.ansatz.constraints import hermite
 from ponn_torch.ansatz.expression import ConstrainedExpression
 from ponn_torch.numerics.nodes import NodeSet
+from ponn_torch.optimal_control.meaning import Keyed, meaning
 
 if TYPE_CHECKING:
     from ponn_torch.optimal_control.discretisation import Discretisation, Group
+
+Free = TypeVar("Free", bound=FreeFunction)
 
 # [equations' group, chains' group][e]: ∂(equation d at node n)/∂y_d'^(e) as (..., K, d, n, d'), times √weight where
 # rows are points; the equations' own highest derivatives, of which each sees its own with factor 1, are left out
@@ -108,10 +112,7 @@ class LinearExpressions:
         for group in self.groups:
             how = self.nodes, group.order, discretisation.conditioning
             given = discretisation.combinations.get(group.order)
-            if given is None and not dict(basis.named_buffers()):
-                made = _made_once(type(basis), tuple(basis.arguments.items()), *how)
-            else:
-                made = _made(basis, *how, given)
+            made = _made_once(shared(basis), *how) if given is None and says_all(basis) else _made(basis, *how, given)
             B = _free(group, made.B)
             both = torch.cat([B, group.Omega], -1).movedim(-1, 0).flatten(1)
             start = tables[-1].own.stop if tables else 0
@@ -221,11 +222,27 @@ def _made(
 
 
 @lru_cache(maxsize=64)
-def _made_once(
-    kind: type[LinearBasis], arguments: tuple[tuple[str, Any], ...], nodes: NodeSet, order: int, conditioning: str
-) -> _AtNodes:
-    """The same for all problems, where the basis draws nothing: its arguments say all."""
-    return _made(kind(**dict(arguments)), nodes, order, conditioning)
+def _made_once(basis: LinearBasis, nodes: NodeSet, order: int, conditioning: str) -> _AtNodes:
+    """The same for all problems."""
+    return _made(basis, nodes, order, conditioning)
+
+
+def says_all(basis: FreeFunction) -> bool:
+    """Whether the arguments of a basis say all of it: nothing is drawn or trained."""
+    return isinstance(basis, LinearBasis) and not [*basis.parameters(), *basis.buffers()]
+
+
+def shared(basis: Free) -> Free:
+    """One basis for all that are of a class and called alike, where that says all; any other as it is."""
+    if not says_all(basis):
+        return basis
+    return cast(Free, _made_alike(Keyed((type(basis), meaning([type(basis), basis.arguments], basis)), basis)))
+
+
+@lru_cache(maxsize=64)
+def _made_alike(stated: Keyed[FreeFunction]) -> FreeFunction:
+    """Made anew, so that it stays what it is whatever becomes of the caller's."""
+    return type(stated.value)(**deepcopy(stated.value.arguments))
 
 
 def _free(group: Group, table: Tensor) -> Tensor:

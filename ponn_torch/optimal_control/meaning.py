@@ -6,15 +6,27 @@ all that was derived from the old ones holds for it.
 
 from __future__ import annotations
 
+import dis
+import os
 import sys
 from collections import OrderedDict
-from collections.abc import Hashable, Iterable
+from collections.abc import Hashable, Iterable, Iterator
 from dataclasses import dataclass, field, fields, is_dataclass
 from enum import Enum
-from functools import cached_property, partial
+from functools import cached_property, lru_cache, partial
 from pathlib import Path
 from sysconfig import get_path
-from types import BuiltinFunctionType, CodeType, FunctionType, MappingProxyType, MethodType, ModuleType, SimpleNamespace
+from types import (
+    BuiltinFunctionType,
+    CodeType,
+    FunctionType,
+    GetSetDescriptorType,
+    MappingProxyType,
+    MemberDescriptorType,
+    MethodType,
+    ModuleType,
+    SimpleNamespace,
+)
 from typing import Any, Generic, TypeVar
 
 import numpy as np
@@ -24,10 +36,16 @@ T = TypeVar("T")
 
 LARGE = 65536  # bytes of an array that is not looked into
 MOST = 2000  # values that are looked at
-STDLIB = get_path("stdlib")
+UNCHANGING = tuple(f"{folder}{os.sep}" for folder in (get_path("stdlib"), Path(__file__).parents[1]))
+LOOK_UPS = ("LOAD_GLOBAL", "LOAD_NAME", "LOAD_FROM_DICT_OR_GLOBALS")  # operations that find a global
 _PLAIN = (type(None), bool, int, float, complex, str, bytes, range, slice, torch.device, torch.dtype)
 _COLLECTIONS = (tuple, list, set, frozenset, torch.Size)
 _MAPPINGS = (dict, OrderedDict, MappingProxyType)
+_ABOUT = {  # entries of a class that nothing is computed with
+    *("__doc__", "__module__", "__annotations__", "__annotate_func__", "__annotations_cache__"),
+    *("__dataclass_fields__", "__dataclass_params__", "__orig_bases__", "__parameters__"),
+    *("__abstractmethods__", "_abc_impl"),
+}
 
 
 @dataclass(frozen=True)
@@ -51,16 +69,18 @@ class Itself:
         return id(self.value)
 
 
-_FIXED = (ModuleType, BuiltinFunctionType, np.ufunc, Enum)  # what is the same as long as it is the same object
+# what is the same as long as it is the same object
+_FIXED = (BuiltinFunctionType, np.ufunc, Enum, MemberDescriptorType, GetSetDescriptorType)
 
 
 def meaning(value: Any, owner: object) -> Hashable:
     """Equal for two values only if functions that read one or the other compute the same.
 
     Numbers, text, collections and arrays count by content, functions by code and by the values of all that it reads
-    (globals, defaults, captured ones), frozen dataclasses by their fields; classes, and what is installed, as
-    themselves. What else there is may change in ways that cannot be seen: it stands for its ``owner``, the one
-    statement that it is part of, and so does what it would take too long to look through.
+    (globals, defaults, captured ones, what it takes from modules), frozen dataclasses by their fields and methods;
+    what is installed counts as itself, and so does a class, together with what it holds. What else there is may change
+    in ways that cannot be seen: it stands for its ``owner``, the one statement that it is part of. So does a function
+    that imports, and what it would take too long to look through.
     """
     return _Reader(owner).of(value)
 
@@ -97,8 +117,12 @@ class _Reader:
     def _parts(self, value: Any) -> Iterable[Any] | None:
         """All that a value consists of; None where that cannot be told."""
         kind = type(value)
-        if kind in _COLLECTIONS or (isinstance(value, tuple) and hasattr(kind, "_fields")):
+        if kind in _COLLECTIONS:
             return list(value)
+        if isinstance(value, tuple) and hasattr(kind, "_fields"):
+            return [kind, *value]
+        if isinstance(value, type):
+            return [Itself(value), *_held(value)]
         if kind in _MAPPINGS:
             return [*value.keys(), *value.values()]
         if kind is SimpleNamespace:
@@ -107,10 +131,16 @@ class _Reader:
             return [value.func, value.args, value.keywords]
         if kind is MethodType:
             return [value.__func__, value.__self__]
-        if kind is FunctionType:
+        if kind in (staticmethod, classmethod):
+            return [value.__func__]
+        if kind is property:
+            return [value.fget, value.fset, value.fdel]
+        if kind is cached_property:
+            return [value.func]
+        if kind is FunctionType and not _imports(value.__code__):
             return [value.__code__, vars(value), value.__defaults__, value.__kwdefaults__, *_read(value)]
         if _holds_fields_only(value):
-            return [getattr(value, f.name, self._unknown) for f in fields(value)]
+            return [kind, *(getattr(value, f.name, self._unknown) for f in fields(value))]
         return None
 
 
@@ -127,41 +157,83 @@ def _array(value: Any) -> np.ndarray[Any, Any] | None:
     return value
 
 
-def _read(function: FunctionType) -> Iterable[Any]:
+def _read(function: FunctionType) -> Iterator[Any]:
     """The globals that a function may read, with their names, and what it captured."""
-    names = _names(function.__code__)
-    for name in sorted(names & function.__globals__.keys()):
-        value = function.__globals__[name]
+    code, known, modules = function.__code__, function.__globals__, set[ModuleType]()
+    for name in sorted(_globals(code) & known.keys()):
         yield name
-        yield value
-        if isinstance(value, ModuleType) and not _installed(value):
-            yield from ((part, getattr(value, part)) for part in sorted(names) if hasattr(value, part))
+        yield from _seen(known[name], code, modules)
     for cell in function.__closure__ or ():
         try:
-            yield cell.cell_contents
+            yield from _seen(cell.cell_contents, code, modules)
         except ValueError:  # a name that has no value yet
             yield Itself(cell)
 
 
+def _seen(value: Any, code: CodeType, before: set[ModuleType]) -> Iterator[Any]:
+    """A value that code reads; of a user's module, and of those in it, all that the code may take from it."""
+    if not isinstance(value, ModuleType) or _installed(value):
+        yield value
+        return
+    yield Itself(value)
+    if value not in before:
+        before.add(value)
+        for name in sorted(_names(code) & vars(value).keys()):
+            yield name
+            yield from _seen(vars(value)[name], code, before)
+
+
+def _held(kind: type) -> Iterator[Any]:
+    """What a user's class is made of: its bases, and its methods and values with their names."""
+    yield from kind.__bases__
+    for name in sorted(vars(kind).keys() - _ABOUT):
+        yield name
+        yield vars(kind)[name]
+
+
+def _within(code: CodeType) -> Iterator[CodeType]:
+    """The code of a function, and of the functions in it."""
+    yield code
+    for constant in code.co_consts:
+        if isinstance(constant, CodeType):
+            yield from _within(constant)
+
+
+def _steps(code: CodeType) -> Iterator[dis.Instruction]:
+    return (step for part in _within(code) for step in dis.get_instructions(part))
+
+
+@lru_cache(maxsize=1024)
+def _globals(code: CodeType) -> frozenset[str]:
+    """Names that are looked up among the globals; attributes of the same name are not."""
+    return frozenset(step.argval for step in _steps(code) if step.opname in LOOK_UPS)
+
+
 def _names(code: CodeType) -> set[str]:
-    """Names of globals and attributes in the code of a function, and of the functions in it."""
-    inner = (constant for constant in code.co_consts if isinstance(constant, CodeType))
-    return set(code.co_names).union(*map(_names, inner))
+    """Names of globals and attributes."""
+    return {name for part in _within(code) for name in part.co_names}
+
+
+@lru_cache(maxsize=1024)
+def _imports(code: CodeType) -> bool:
+    return any(step.opname == "IMPORT_NAME" for step in _steps(code))
 
 
 def _installed(value: Any) -> bool:
-    """Whether a module, class or function without captured values is Python's or a package's: it does not change."""
-    path: str | None
-    if isinstance(value, FunctionType) and not value.__closure__:
+    """Whether a module, class or function of a module is Python's or a package's, this one's too: it does not change.
+
+    A function made by another one is not: it is made anew.
+    """
+    if isinstance(value, FunctionType) and not value.__closure__ and "<locals>" not in value.__qualname__:
         path = value.__code__.co_filename
     elif isinstance(value, ModuleType | type):
         module = value if isinstance(value, ModuleType) else sys.modules.get(value.__module__)
-        path = getattr(module, "__file__", None) if module is not None else ""
+        if getattr(module, "__name__", "") in sys.builtin_module_names:
+            return True
+        path = getattr(module, "__file__", None) or ""
     else:
         return False
-    return (
-        path is None or not {"site-packages", "dist-packages"}.isdisjoint(Path(path).parts) or path.startswith(STDLIB)
-    )
+    return path.startswith(UNCHANGING) or not {"site-packages", "dist-packages"}.isdisjoint(Path(path).parts)
 
 
 def _holds_fields_only(value: Any) -> bool:

@@ -248,5 +248,5 @@ def _solved(twin: OptimalControlProblem, solver: Solver, seed: int) -> tuple[Sol
     """The certified extremal of a twin, if there is one, and CPU seconds."""
     given = solver.refinement
     refinement = given if given is not None and given.exact and given.reads_arcs else Split()
-    result = replace(solver, refinement=refinement).solve(twin, seed)
+    result = replace(solver, refinement=refinement, dtype=torch.float64).solve(twin, seed)
     return result.solution if result.certified else None, result.cpu_seconds

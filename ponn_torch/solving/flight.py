@@ -61,7 +61,7 @@ def fly(
     ``restarts`` are times at which the first entries of y are put back to given values.
     """
     times, values, arcs, jumps, y = [], [], [], [], start
-    n_evaluations, message = 0, ""
+    n_evaluations, message, singular = 0, "", ""
     for arc, begin, end, given in _legs(knots, restarts):
         if given is not None:
             jumps.append(float(np.abs(y[: len(given)] - given).max()))
@@ -74,7 +74,12 @@ def fly(
             return float((np.maximum(edges[:-1] - t, 0.0) + lengths)[ahead].min()) if ahead.any() else np.inf
 
         def function(t: float, y: Array, arc: int = arc) -> Array:
-            return rates(t, y, arc)
+            nonlocal singular
+            try:
+                return rates(t, y, arc)
+            except torch.linalg.LinAlgError as error:  # type: ignore[attr-defined]
+                singular = str(error)
+                return np.full_like(y, np.nan)  # a step too far: it is tried again, shorter
 
         times.append(begin)
         values.append(y)
@@ -97,12 +102,13 @@ def fly(
                 message = solver.step() or ""
                 if solver.status == "failed" or not np.isfinite(solver.y).all() or len(times) > most_steps:
                     break
+                singular = ""
                 times.append(solver.t)
                 values.append(solver.y)
                 arcs.append(arc)
         n_evaluations += solver.nfev
         if solver.status != "finished":
-            reason = message or "the states are not finite, or too many steps"
+            reason = singular or message or "the states are not finite, or too many steps"
             message = f"the flight ended at {solver.t / knots[-1]:.3f} of the final time: {reason}"
             break
         y = solver.y

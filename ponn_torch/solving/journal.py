@@ -6,14 +6,15 @@ under way goes on from its checkpoint, and what lies between them is computed an
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import json
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
 
 import torch
 from torch import Tensor
 
-from ponn_torch.optim.base import Callback, Optimizer, OptimizeResult, Residual, Status
+from ponn_torch.optim.base import Callback, Optimizer, OptimizeResult, Residual, Status, replayed
 from ponn_torch.optim.checkpoint import (
     Arrays,
     CheckpointFile,
@@ -25,9 +26,15 @@ from ponn_torch.optim.checkpoint import (
     write,
 )
 
+BELONGS = "belongs_to.json"
+
+
+class ForeignJournal(ValueError):
+    """A journal that was kept for another solve."""
+
 
 class Journal:
-    """One file per finished call in a folder, and the checkpoint of the one under way.
+    """One file per finished call in a folder, the checkpoint of the one under way, and what solve they belong to.
 
     Raises:
         FileNotFoundError: ``resume`` with nothing in the folder.
@@ -39,6 +46,27 @@ class Journal:
         if resume and not any(folder.glob("*.npz")):
             raise FileNotFoundError(f"nothing to resume: no checkpoint in {str(folder)!r}")
 
+    def belongs_to(self, solve: Mapping[str, str]) -> None:
+        """Keep the digests of all that a solve is determined by, or hold them against those that were kept.
+
+        Raises:
+            ForeignJournal: to go on with another solve; the message names what differs.
+        """
+        path = self.folder / BELONGS
+        if self._replaying:
+            before = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
+            others = [name for name, digest in solve.items() if before.get(name) != digest]
+            if others:
+                raise ForeignJournal(
+                    f"{str(self.folder)!r} holds a solve with other values of {', '.join(others)}; "
+                    "allowed: to go on with the same problem, seed and settings, but for the budget"
+                )
+        else:
+            self.folder.mkdir(parents=True, exist_ok=True)
+            for left in self.folder.glob("[0-9][0-9][0-9]*.npz"):  # by an earlier solve
+                left.unlink()
+            path.write_text(json.dumps(dict(solve), indent=2) + "\n", encoding="utf-8")
+
     def run(
         self,
         optimizer: Optimizer,
@@ -47,16 +75,16 @@ class Journal:
         on_iteration: Callback | None = None,
         spend: Callable[[float], None] = lambda seconds: None,
     ) -> OptimizeResult:
-        """What ``optimizer.run`` gives, or gave; ``spend`` is told of CPU seconds that an earlier process took."""
+        """What ``optimizer.run`` gives, or gave; ``spend`` is told of CPU seconds that an earlier process took.
+
+        Where the callback ends the run while it is told of what was done before, the status says so.
+        """
         finished, under_way = (self.folder / f"{self._count:03d}{suffix}.npz" for suffix in ("", "_under_way"))
         self._count += 1
         if self._replaying and finished.is_file():
             result = _unpack(read(finished), xi)
             spend(result.cpu_seconds)
-            r = residual.residual(result.xi)
-            for entry in result.records if on_iteration is not None else ():
-                on_iteration(entry, result.xi, r)  # type: ignore[misc]
-            return result
+            return result if on_iteration is None else _told_of(result, residual, on_iteration)
         checkpoint = CheckpointFile(under_way, resume=self._replaying and under_way.is_file(), seconds=self._seconds)
         self._replaying = False
         if checkpoint.saved is not None:
@@ -67,6 +95,13 @@ class Journal:
             write(finished, _pack(result))
             under_way.unlink(missing_ok=True)
         return result
+
+
+def _told_of(result: OptimizeResult, residual: Residual, on_iteration: Callback) -> OptimizeResult:
+    """A finished result, once its callback was told of its iterations."""
+    r = residual.residual(result.xi)
+    cut = replayed(result.records, lambda entry: on_iteration(entry, result.xi, r))
+    return result if cut is None else replace(result, status=cut)
 
 
 def _pack(result: OptimizeResult) -> Arrays:

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from ponn_torch.ansatz.basis import FreeFunction, Legendre
 from ponn_torch.numerics.nodes import make_nodes
-from ponn_torch.optim.base import Callback, Optimizer, OptimizeResult, Stopping
+from ponn_torch.optim.base import Callback, NonFiniteResidual, Optimizer, OptimizeResult, Status, Stopping
 from ponn_torch.optim.chain import Chain, OutputLayer
 from ponn_torch.optim.least_squares import LevenbergMarquardt
 from ponn_torch.optimal_control.boundary_value_problem import BoundaryValueProblem
@@ -65,6 +65,25 @@ class Refined:
         return self.made_by or self.rounds[-1]
 
 
+@dataclass
+class Rounds:
+    """The rounds of a refinement so far: every result, and the last curve that is solved.
+
+    Attributes:
+        curve: the one that is given, as long as no round is solved.
+        made_by: the result of the curve, where it is that of a round.
+    """
+
+    curve: Curve
+    callback: MakeCallback | None = None
+    results: list[OptimizeResult] = field(default_factory=list)
+    made_by: OptimizeResult | None = None
+
+    def interrupted(self) -> Refined:
+        """What there is when the refinement is ended from outside."""
+        return Refined(self.curve, Outcome.INTERRUPTED, self.results, made_by=self.made_by)
+
+
 class Refinement(Protocol):
     """What makes a solved curve a better one; inherit from it."""
 
@@ -72,7 +91,7 @@ class Refinement(Protocol):
     exact: ClassVar[bool] = True  # whether what it solves is meant to be certified, or only sharper than before
 
     def run(self, start: Curve, callback: MakeCallback | None = None, blunter: Curve | None = None) -> Refined:
-        """Refine a curve; never raises for want of convergence, the outcome says how it ended.
+        """Refine a curve; never raises for want of convergence or for Ctrl-C, the outcome says how it ended.
 
         ``blunter`` is the solution of a larger smoothing, where there is one: the two tell where S goes without any.
         """
@@ -115,22 +134,31 @@ class Segmentation:
     def discretisation(self, bvp: BoundaryValueProblem) -> Discretisation:
         nodes = make_nodes("legendre_gauss", self.n_nodes, dtype=bvp.unit.dtype, device=bvp.unit.device)
         basis = self.basis if isinstance(self.basis, FreeFunction) else self.basis(self.n_neurons)
-        basis = basis.to(dtype=bvp.unit.dtype, device=bvp.unit.device)
         return discretise(bvp, basis, nodes, Strong(), "orthonormal")
 
-    def solve(
-        self, collocation: Collocation, start: Curve, callback: MakeCallback | None
-    ) -> tuple[Curve, OptimizeResult]:
-        """One round, from the projection of ``start``; of networks the output layers are solved for last."""
+    def solve(self, collocation: Collocation, start: Curve, rounds: Rounds) -> tuple[Curve, OptimizeResult]:
+        """One round, from the projection of ``start``; of networks the output layers are solved for last.
+
+        A round that starts where the residual is not finite has failed: a finer grid may meet a singularity that a
+        coarser one steps over.
+        """
         deep = len(collocation.linear_unknowns) < collocation.n_unknowns
         optimizer: Optimizer = LevenbergMarquardt(
             self.stopping, damping=self.damping, linear_solver=self.linear_solver, ahead=not deep
         )
         if deep:
             optimizer = Chain([optimizer, OutputLayer()])
-        on_iteration = callback(collocation) if callback else None
-        result = optimizer.run(collocation, project(collocation, start), on_iteration)
-        return Curve(collocation, result.xi), result
+        on_iteration = rounds.callback(collocation) if rounds.callback else None
+        xi = project(collocation, start)
+        try:
+            result = optimizer.run(collocation, xi, on_iteration)
+        except NonFiniteResidual:
+            result = OptimizeResult(xi, xi.new_tensor(torch.inf), Status.NON_FINITE)
+        curve = Curve(collocation, result.xi)
+        rounds.results.append(result)
+        if self.solved(result):
+            rounds.curve, rounds.made_by = curve, result
+        return curve, result
 
     def finer(self) -> Self | None:
         """The same with polynomials of higher degree on every segment; None for networks, which have their own size."""
@@ -200,27 +228,34 @@ class Subdivide(Segmentation, Refinement):
     reads_arcs: ClassVar[bool] = False
 
     def run(self, start: Curve, callback: MakeCallback | None = None, blunter: Curve | None = None) -> Refined:
-        bvp, setting = start.collocation.bvp, start.collocation.setting
-        rounds: list[OptimizeResult] = []
+        rounds = Rounds(start, callback)
+        try:
+            return self._halved(start, rounds)
+        except KeyboardInterrupt:
+            return rounds.interrupted()
+
+    def _halved(self, start: Curve, rounds: Rounds) -> Refined:
+        bvp, setting, results = start.collocation.bvp, start.collocation.setting, rounds.results
         disc = self.discretisation(bvp)
         share = torch.linspace(0, 1, self.n_segments + 1, dtype=start.xi.dtype, device=start.xi.device)
         times = share * start.times[-1]
         curve, outcome = start, Outcome.COARSE
         for _ in range(self.max_rounds):
             if len(times) - 1 > self.max_segments:
-                return Refined(curve, Outcome.TOO_MANY_SEGMENTS, rounds)
-            solution, result = self.solve(Collocation.on_segments(disc, times, setting=setting), curve, callback)
-            rounds.append(result)
+                return Refined(curve, Outcome.TOO_MANY_SEGMENTS, results)
+            solution, result = self.solve(Collocation.on_segments(disc, times, setting=setting), curve, rounds)
             if result.status.cut:
-                return Refined(solution, Outcome.INTERRUPTED, rounds)
+                return rounds.interrupted()
+            if result.status is Status.NON_FINITE:
+                return Refined(curve, Outcome.RESIDUAL, results, f": {result.status.value}")
             if self.solved(result):
                 curve, outcome = solution, Outcome.COARSE
                 coarse = self.coarse(curve)
                 if not bool(coarse.any()):
-                    return Refined(curve, Outcome.SOLVED, rounds)
+                    return Refined(curve, Outcome.SOLVED, results)
             else:
                 outcome, coarse = Outcome.RESIDUAL, self.coarse(solution)
                 coarse = coarse if bool(coarse.any()) else ~coarse  # the same round again would fail again
             middles = 0.5 * (solution.times[:-1] + solution.times[1:])
             times = torch.cat([solution.times, middles[coarse]]).sort().values
-        return Refined(curve, outcome, rounds)
+        return Refined(curve, outcome, results)

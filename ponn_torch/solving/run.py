@@ -77,6 +77,8 @@ class Run:
         self.refused: list[Tensor] = []  # where smoothed solutions began whose refinement failed
         self.causes: list[str] = []  # why starts failed, in short
         self.clock, self.journal = Budget(solver.cpu_seconds), journal
+        if journal is not None:
+            journal.belongs_to(solver.determined_by(problem, seed))
         self.measurements = None if solver.data is None else solver.data.of(problem)
 
     # -- the line ------------------------------------------------------------------------------------------------------
@@ -107,8 +109,8 @@ class Run:
                     best, message = (candidate, judged), note or judged.verdict
                     verdict = message
                 # a start that came through its stages is the answer where nothing aims at a certificate
-                enough = n_certified if self.solver.exact else 1
-                if enough >= self.solver.n_certified or self.clock.spent:
+                enough = n_certified >= self.solver.n_certified or not self.solver.exact
+                if enough or self.clock.spent:
                     break
         except (_Interrupted, KeyboardInterrupt):
             interrupted, message = True, "interrupted; the best stage so far is kept"
@@ -122,7 +124,7 @@ class Run:
         spent = self.clock.spent and n_certified < self.solver.n_certified
         if spent and not (best and best[1].certified) and Status.BUDGET.value not in message:
             message = f"{Status.BUDGET.value}: {message}"
-        solution = best[0] if best else self._last_stage()
+        solution = best[0] if best else self._best_stage()
         if solution is not None:
             self.observer.solution(solution)
         if best is not None:
@@ -171,9 +173,17 @@ class Run:
         closer = certify(again, self.solver.tolerances)
         return (again, closer) if closer.certified else (candidate, judged)
 
-    def _last_stage(self) -> Solution | None:
-        solutions = [s.solution for s in self.stages if s.solution is not None]
-        return solutions[-1] if solutions else None
+    def _best_stage(self) -> Solution | None:
+        """The last stage that is solved and can be trusted, if there is one; one that was cut has to be as good."""
+        kept = [(stage, stage.solution) for stage in self.stages if stage.solution is not None]
+        best: tuple[StageResult, Solution] | None = None
+        for stage, solution in kept:
+            solved = stage.norm < self.solver.start_limit and self.trusted(solution)
+            if solved and (best is None or not stage.status.cut or stage.norm <= best[0].norm):
+                best = stage, solution
+        if best is None and kept:
+            best = min(kept, key=lambda pair: pair[0].norm)
+        return best[1] if best else None
 
     # -- smoothed stages ---------------------------------------------------------------------------------------------
 

@@ -109,10 +109,13 @@ class SingleDomain(Refinement, ABC):
             outcome = Outcome.SOLVED if off_node <= self.off_node_tolerance else Outcome.COARSE
             return Step.SOLVED
 
-        if start.smoothing:
-            Adaptive(start.smoothing, min(self.last, start.smoothing), self.factor, self.max_halvings).run(attempt)
-        else:
-            attempt(None, "smoothing", None)
+        try:
+            if start.smoothing:
+                Adaptive(start.smoothing, min(self.last, start.smoothing), self.factor, self.max_halvings).run(attempt)
+            else:
+                attempt(None, "smoothing", None)
+        except KeyboardInterrupt:
+            outcome = Outcome.INTERRUPTED
         return Refined(kept, outcome, rounds, made_by=made_by)
 
     def _rung(

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 
 import torch
 
@@ -18,6 +18,7 @@ from ponn_torch.optim.base import Optimizer, Stopping
 from ponn_torch.optim.least_squares import LevenbergMarquardt
 from ponn_torch.optimal_control.boundary_value_problem import BoundaryValueProblem
 from ponn_torch.optimal_control.discretisation import Discretisation, Form, Strong, discretise
+from ponn_torch.optimal_control.fingerprint import fingerprint
 from ponn_torch.optimal_control.measurements import MeasurementFile, Measurements
 from ponn_torch.optimal_control.problem import OptimalControlProblem
 from ponn_torch.solving.certificate import Tolerances
@@ -64,6 +65,7 @@ class Solver:
         trust: a stage is kept while its off-node residual is below this fraction of the largest rate; below the
             resolution of the nodes the residual between them gives a broken stage away.
         data: measurements that join the smoothed stages' residual; a refinement solves the problem as stated.
+        dtype: float64, or float32 where no refinement is to be certified.
         cpu_seconds: budget of the whole solve, certificates apart; what there is when it is spent is kept.
     """
 
@@ -99,6 +101,10 @@ class Solver:
             raise ValueError(f"n_segments = {self.n_segments}; allowed: at least 1, or a list of such numbers")
         if not self.warm_damping >= 0:
             raise ValueError(f"warm_damping = {self.warm_damping}; allowed: a number ≥ 0")
+        if self.dtype != torch.float64 and self.exact:  # whose rounds end far below the round-off of float32
+            name, refinement = str(self.dtype).removeprefix("torch."), type(self.refinement).__name__
+            allowed = "float64, or float32 with refinement = None"
+            raise ValueError(f"dtype = {name} with refinement = {refinement}; allowed: {allowed}")
         if not self.cpu_seconds > 0:
             raise ValueError(f"cpu_seconds = {self.cpu_seconds}; allowed: a positive number")
 
@@ -125,11 +131,20 @@ class Solver:
         """Solve from random starts of ``seed``; the result's message says what happened, it does not raise.
 
         A ``journal`` keeps what the smoothed stages computed, or gives it back.
+
+        Raises:
+            ForeignJournal: a journal of another solve, before anything is computed.
         """
         return Run(self, problem, seed, observer or SilentObserver(), journal).result()
+
+    def determined_by(self, problem: OptimalControlProblem, seed: int) -> dict[str, str]:
+        """A digest of everything that a solve's result depends on, by name: all but the budget."""
+        basis = [type(self.basis), self.basis.arguments, self.basis.state_dict()]
+        settings = {item.name: getattr(self, item.name) for item in fields(self) if item.name != "cpu_seconds"}
+        values = {"problem": problem, "seed": seed, **settings, "basis": basis}
+        return {name: fingerprint(value) for name, value in values.items()}
 
     def discretisation(self, bvp: BoundaryValueProblem, form: Form | None = None) -> Discretisation:
         like = bvp.unit
         nodes = make_nodes(self.node_kind, self.n_nodes, dtype=like.dtype, device=like.device)
-        basis = self.basis.to(dtype=like.dtype, device=like.device)
-        return discretise(bvp, basis, nodes, form or self.form, self.conditioning)
+        return discretise(bvp, self.basis, nodes, form or self.form, self.conditioning)

@@ -16,14 +16,23 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
-from ponn_torch.optim.base import OptimizeResult, Status
+from ponn_torch.optim.base import Status
 from ponn_torch.optimal_control.boundary_value_problem import Setting
 from ponn_torch.optimal_control.collocation import Collocation
 from ponn_torch.optimal_control.control_laws import Regime
 from ponn_torch.optimal_control.curve import Curve
 from ponn_torch.optimal_control.discretisation import Discretisation
 from ponn_torch.optimal_control.problem import DisplayUnit
-from ponn_torch.solving.refinement import MakeCallback, Outcome, Refined, Refinement, Segmentation, Segments, shared_out
+from ponn_torch.solving.refinement import (
+    MakeCallback,
+    Outcome,
+    Refined,
+    Refinement,
+    Rounds,
+    Segmentation,
+    Segments,
+    shared_out,
+)
 from ponn_torch.solving.sharpening import graded_times, singular_interval, undecided
 from ponn_torch.solving.switching import Structure, claimed_structure, find_structure, needles, without_short_arcs
 
@@ -43,8 +52,7 @@ class _Search:
     """
 
     discretisation: Discretisation
-    callback: MakeCallback | None
-    rounds: list[OptimizeResult] = field(default_factory=list)
+    rounds: Rounds
     tried: dict[int, list[Structure]] = field(default_factory=lambda: defaultdict(list))
 
 
@@ -73,14 +81,20 @@ class Split(Segmentation, Refinement):
     sharpening: float = 0.5
 
     def run(self, start: Curve, callback: MakeCallback | None = None, blunter: Curve | None = None) -> Refined:
-        search = _Search(self.discretisation(start.collocation.bvp), callback)
-        rounds = search.rounds
+        search = _Search(self.discretisation(start.collocation.bvp), Rounds(start, callback))
+        try:
+            return self._searched(search, start, blunter)
+        except KeyboardInterrupt:
+            return search.rounds.interrupted()
+
+    def _searched(self, search: _Search, start: Curve, blunter: Curve | None) -> Refined:
+        rounds = search.rounds.results
         read: list[tuple[Structure, int]] = []
         rungs: list[tuple[float, Curve]] = []
         refined = Refined(start, Outcome.STRUCTURE, rounds)
         for smoothed, n_segments in self._starts(search, start):
             if rounds and rounds[-1].status.cut:
-                return Refined(smoothed, Outcome.INTERRUPTED, rounds)
+                return search.rounds.interrupted()
             structures = [find_structure(smoothed, polish=0)]
             if smoothed.smoothing:
                 rungs.append((smoothed.smoothing, smoothed))
@@ -122,8 +136,7 @@ class Split(Segmentation, Refinement):
             if len(times) - 1 > self.max_segments:  # as where a component of the control has no effect, and S is noise
                 return
             collocation = Collocation.on_segments(search.discretisation, times, setting=start.collocation.setting)
-            curve, result = self.solve(collocation.with_setting(smoothing=sharper), start, search.callback)
-            search.rounds.append(result)
+            curve, result = self.solve(collocation.with_setting(smoothing=sharper), start, search.rounds)
             if result.status.cut or float(result.norm) < LEGIBLE:
                 start, smoothing = curve, sharper
                 yield start, least
@@ -134,7 +147,7 @@ class Split(Segmentation, Refinement):
 
     def _split(self, search: _Search, curve: Curve, structure: Structure, n_segments: int) -> Refined:
         """Rounds from one curve, depth first through the repairs of its arcs; the last curve that is solved is kept."""
-        disc, rounds, tried = search.discretisation, search.rounds, search.tried[n_segments]
+        disc, rounds, tried = search.discretisation, search.rounds.results, search.tried[n_segments]
         bvp, parameters = disc.bvp, curve.collocation.setting.parameters
         pending = [(curve, _spread(structure, curve.times, n_segments), math.inf)]
         outcome = Outcome.STRUCTURE
@@ -150,10 +163,9 @@ class Split(Segmentation, Refinement):
             collocation = Collocation.on_segments(
                 disc, segments.times, events=segments.events, setting=Setting(regime, parameters)
             )
-            solution, result = self.solve(collocation, before, search.callback)
-            rounds.append(result)
+            solution, result = self.solve(collocation, before, search.rounds)
             if result.status.cut:
-                return Refined(solution, Outcome.INTERRUPTED, rounds)
+                return search.rounds.interrupted()
             solved, found = self.solved(result), claimed_structure(solution)
             if solved and any(found.near(other, SAME_SWITCH) for other in tried):
                 curve, outcome = solution, Outcome.STRUCTURE

@@ -52,6 +52,8 @@ class TwoLoop(Segmentation, Refinement):
             loops.solve()
         except _Ended as ended:
             return Refined(Curve(collocation, loops.xi), ended.outcome, loops.rounds)
+        except KeyboardInterrupt:
+            return Refined(Curve(collocation, loops.xi), Outcome.INTERRUPTED, loops.rounds)
         curve = Curve(collocation, loops.xi)
         if not find_structure(curve).same_arcs(structure):
             return Refined(curve, Outcome.STRUCTURE, loops.rounds)

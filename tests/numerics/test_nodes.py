@@ -205,6 +205,13 @@ def test_graded_panels_resolve_layers_and_widen_away_from_them():
         graded_edges(centres, -widths)
 
 
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_layers_below_the_spacing_of_numbers_end_at_it(dtype):
+    edges = graded_edges(torch.tensor([0.3], dtype=dtype), torch.tensor([1e-30], dtype=dtype))
+    assert bool((edges.diff() > 0).all())
+    assert edges.diff().min() < 4 * torch.finfo(dtype).eps
+
+
 def test_a_node_set_is_frozen():
     nodes = make_nodes("uniform", 4)
     assert isinstance(nodes, NodeSet)

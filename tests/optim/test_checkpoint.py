@@ -11,7 +11,8 @@ import torch
 from helpers import OPTIMIZERS, random
 from test_least_squares import landing, start_of
 
-from ponn_torch.optim.base import Status, Stopping
+from ponn_torch.optim import driver
+from ponn_torch.optim.base import Status, Stop, Stopping
 from ponn_torch.optim.chain import Chain
 from ponn_torch.optim.checkpoint import CheckpointFile, read, write
 from ponn_torch.optim.gradient import Adam
@@ -63,6 +64,44 @@ def test_a_resumed_run_equals_the_uninterrupted_one(name, count, tmp_path: Path)
     assert resumed.cpu_seconds > cut.records[-1]["seconds"]
     seconds = [record["seconds"] for record in resumed.records]
     assert seconds == sorted(seconds)
+
+
+@pytest.mark.parametrize("stop", [Stop(Status.BUDGET), KeyboardInterrupt()], ids=["budget", "keyboard"])
+@pytest.mark.parametrize("name", ["levenberg_marquardt", "chain", "nested_chain"])
+def test_a_resumed_run_that_is_ended_at_once_keeps_its_best_point(name, stop, tmp_path: Path):
+    optimizer, (residual, start) = RESUMABLE[name], landing()
+    whole = optimizer.run(residual, start)
+    cut = optimizer.run(residual, start, interrupt_at(12), CheckpointFile(tmp_path / "state.npz"))
+
+    def end(record, xi, r):
+        raise stop
+
+    ended = optimizer.run(residual, start, end, CheckpointFile(tmp_path / "state.npz", resume=True))
+    assert ended.status is (stop.status if isinstance(stop, Stop) else Status.INTERRUPTED)
+    assert torch.equal(ended.xi, cut.xi)
+    assert without_times(ended.records) == without_times(cut.records)
+    resumed = optimizer.run(residual, start, None, CheckpointFile(tmp_path / "state.npz", resume=True))
+    assert torch.equal(resumed.xi, whole.xi)
+
+
+def test_an_interrupt_leaves_records_and_state_of_the_same_iteration(monkeypatch, tmp_path: Path):
+    """Ctrl-C may come anywhere: here when an iteration's record was just made."""
+    optimizer, (residual, start) = LevenbergMarquardt(STOPPING), landing()
+    whole, make = optimizer.run(residual, start), driver.record
+
+    def interrupted(**values):
+        made = make(**values)
+        if made["iteration"] == 4:
+            raise KeyboardInterrupt
+        return made
+
+    with monkeypatch.context() as patched:
+        patched.setattr(driver, "record", interrupted)
+        cut = optimizer.run(residual, start, None, CheckpointFile(tmp_path / "state.npz"))
+    assert (cut.status, cut.n_iterations) == (Status.INTERRUPTED, 3)
+    resumed = optimizer.run(residual, start, None, CheckpointFile(tmp_path / "state.npz", resume=True))
+    assert resumed.n_iterations == whole.n_iterations
+    assert torch.equal(resumed.xi, whole.xi)
 
 
 def test_a_batch_resumes_with_its_members_at_different_ends(tmp_path: Path):

@@ -15,7 +15,8 @@ from torch.func import jacfwd, vmap
 
 from ponn_torch.numerics.linalg import DenseJacobian
 from ponn_torch.optim.base import NonFiniteResidual, Residual, Status, Stopping
-from ponn_torch.optim.least_squares import SCALINGS, GaussNewton, LevenbergMarquardt, ScipyLeastSquares
+from ponn_torch.optim.least_squares import SCALINGS, GaussNewton, LevenbergMarquardt
+from ponn_torch.optim.scipy_least_squares import ScipyLeastSquares
 from ponn_torch.solving.guess import RandomGuess, project
 
 MATRIX = random(5, 2, seed=4)
@@ -528,7 +529,17 @@ def test_scipy_obeys_the_rules_of_stopping(method):
     status, seen = run("powell_singular", tolerance=1e-3, past_tolerance=True)
     assert len(seen) > len(run("powell_singular", tolerance=1e-3)[1])
     if status is Status.ROUND_OFF:
-        assert seen[-1] > min(seen[:-1])
+        assert seen[-1] == min(seen)  # what is told is the best point
+
+
+@pytest.mark.parametrize("optimizer", OPTIMIZERS)
+def test_a_callback_is_told_r_at_the_best_point(optimizer):
+    residual, start = start_of("rosenbrock")
+    told = []
+    OPTIMIZERS[optimizer](Stopping(max_iterations=15)).run(residual, start, lambda *seen: told.append(seen))
+    for record, xi, r in told:
+        assert torch.equal(r, residual.residual(xi))
+        assert float(r.norm()) == pytest.approx(record["norm"], rel=1e-14)
 
 
 def test_scipy_takes_one_problem_at_a_time():

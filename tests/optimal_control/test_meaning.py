@@ -15,6 +15,7 @@ import pytest
 import torch
 from helpers import PROBLEMS
 
+from ponn_torch.ansatz.basis import LinearBasis, RandomFeatures
 from ponn_torch.numerics.tape import RECORDING_PAYS
 from ponn_torch.optimal_control.boundary_value_problem import Setting
 from ponn_torch.optimal_control.collocation import Collocation
@@ -135,7 +136,6 @@ class Float(float):
 OPAQUE = {
     "instance": Mutable(),
     "method of an instance": Mutable().at,
-    "class": Mutable,
     "module": torch.nn.Linear(1, 1),
     "parameter": torch.nn.Parameter(torch.zeros(2)),
     "followed by autograd": torch.zeros(2, requires_grad=True),
@@ -194,7 +194,7 @@ def unrelated(x): return x
 def module(name: str, source: str) -> ModuleType:
     made = ModuleType(name)
     made.__file__ = f"{name}.py"
-    exec(compile(source, made.__file__, "exec"), vars(made))
+    exec(compile(source, made.__file__, "exec", dont_inherit=True), vars(made))
     return made
 
 
@@ -240,6 +240,93 @@ def test_what_is_read_from_a_module_counts():
         assert key(stated.function) != before
     finally:
         del sys.modules["constants"]
+
+
+def test_an_attribute_is_no_global_of_the_same_name(modules):
+    stated = modules("r = 1.0\ndef function(x): return x.r")
+    before = key(stated.function)
+    stated.r = object()
+    assert key(stated.function, ANOTHER) == before
+
+
+CHANGES = {
+    "method of an instance": """
+from dataclasses import dataclass
+G = 1.0
+@dataclass(frozen=True)
+class Planet:
+    name: str = "Mars"
+    def gravity(self): return G
+planet = Planet()
+def function(x): return planet.gravity() * x
+def change(): globals().update(G=2.0)
+""",
+    "inherited property": """
+class Base:
+    G = 1.0
+    @property
+    def gravity(self): return self.G
+class Planet(Base):
+    pass
+def function(x): return Planet().gravity * x
+def change(): Base.G = 2.0
+""",
+    "default of a dataclass": """
+from dataclasses import dataclass
+@dataclass(frozen=True)
+class Vehicle:
+    drag: float = 0.1
+    @staticmethod
+    def lift(): return Vehicle.factor
+    factor = 1.0
+def function(x): return Vehicle().lift() * x
+def change(): Vehicle.factor = 2.0
+""",
+    "submodule": """
+import package
+def function(x): return package.inner.G * x
+def change(): package.inner.G = 2.0
+""",
+    "captured module": """
+import package
+def make(module):
+    def function(x): return module.inner.G * x
+    return function
+function = make(package)
+def change(): package.inner.G = 2.0
+""",
+}
+
+
+@pytest.mark.parametrize("where", CHANGES)
+def test_a_change_is_seen_wherever_it_is_read(where, modules, monkeypatch):
+    package = module("package", "")
+    package.inner = module("package.inner", "G = 1.0")
+    package.inner.package = package  # modules may hold each other
+    monkeypatch.setitem(sys.modules, "package", package)
+    stated = modules(CHANGES[where])
+    monkeypatch.setitem(sys.modules, "stated", stated)
+    before = key(stated.function)
+    assert key(stated.function, ANOTHER) == before
+    stated.change()
+    assert key(stated.function) != before
+
+
+def test_a_function_that_imports_stands_for_its_owner(modules):
+    stated = modules("def function(x):\n    from other_module import scale\n    return scale(x)")
+    assert key(stated.function) != key(stated.function, ANOTHER)
+
+
+def test_a_class_is_itself():
+    """The second solve of a session meets the classes and solutions that the first one left among the globals."""
+
+    @dataclass(frozen=True)
+    class Vehicle:
+        drag: float = 0.1
+
+    assert key(captures(Vehicle)) == key(captures(Vehicle), ANOTHER)
+    assert key(captures(Vehicle)) != key(captures(Gravity))
+    assert key(captures(Mutable)) == key(captures(Mutable), ANOTHER)
 
 
 def test_a_list_that_was_changed_means_something_else():
@@ -376,3 +463,42 @@ def test_a_discretisation_serves_no_other_options():
     assert len({made.equations for made in (plain, single, mass)}) == 3
     disc = Solver().discretisation(bvp)
     assert discretise(bvp, disc.basis, disc.nodes, disc.form, "orthonormal").replays is not disc.replays
+
+
+class Fourier(LinearBasis):
+    """Sines of given frequencies, a basis of a user's own: it draws nothing, and is called with a list."""
+
+    def __init__(self, frequencies: list[float]) -> None:
+        super().__init__(len(frequencies))
+        self.frequencies = frequencies
+
+    @property
+    def arguments(self) -> dict[str, list[float]]:
+        return {"frequencies": self.frequencies}
+
+    def features(self, z: torch.Tensor, order: int) -> torch.Tensor:
+        k = z.new_tensor(self.frequencies)
+        return torch.stack([k**e * torch.sin(k * (z[:, None] + 1) + 0.5 * math.pi * e) for e in range(order + 1)])
+
+
+def test_a_basis_counts_by_what_it_is_called_with():
+    bvp = pontryagin(PROBLEMS["mars_landing"]())
+    one, same, other = Fourier([0.5, 1.0]), Fourier([0.5, 1.0]), Fourier([0.5, 1.5])
+    first, second, third = (Solver(basis).discretisation(bvp) for basis in (one, same, other))
+    assert first is second
+    assert first.expressions.n_own > 0
+    assert third is not first
+    one.frequencies[1] = 1.5
+    assert Solver(one).discretisation(bvp) is third
+    assert first.basis.frequencies == [0.5, 1.0]
+
+
+def test_the_callers_basis_stays_as_it_is():
+    basis = RandomFeatures(8)
+    before, bvp = basis.weight.clone(), pontryagin(PROBLEMS["mars_landing"](), dtype=torch.float32)
+    disc = Solver(basis).discretisation(bvp)
+    assert disc.basis.weight.dtype is torch.float32
+    assert Solver(basis).discretisation(bvp) is disc
+    assert torch.equal(basis.weight, before)
+    assert basis.weight.dtype is torch.float64
+    assert Solver(basis).discretisation(pontryagin(PROBLEMS["mars_landing"]())).basis is basis

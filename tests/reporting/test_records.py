@@ -11,7 +11,8 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from tensorboard.plugins.hparams import plugin_data_pb2
 
 from ponn_torch.optim.base import Status, Stopping
-from ponn_torch.optim.least_squares import LevenbergMarquardt, ScipyLeastSquares
+from ponn_torch.optim.least_squares import LevenbergMarquardt
+from ponn_torch.optim.scipy_least_squares import ScipyLeastSquares
 from ponn_torch.problems.mars_landing import mars_landing
 from ponn_torch.reporting.records import RECORDS, RunRecorder
 from ponn_torch.solving.result import StageResult

@@ -496,6 +496,18 @@ def test_a_flight_whose_rates_are_not_finite_ends_where_it_begins():
     assert flight.message == "the flight ended at 0.000 of the final time: the rates are not finite"
 
 
+def test_a_flight_into_a_singular_matrix_ends_with_the_reason():
+    def rates(t: float, y: np.ndarray, k: int) -> np.ndarray:
+        matrix = torch.tensor([[float(t < 0.5)]], dtype=torch.float64)
+        return torch.linalg.solve(matrix, torch.ones(1, dtype=torch.float64)).numpy()
+
+    history = approximate(lambda t: np.zeros((len(t), 1)), 0.0, 1.0)
+    flight = fly(rates, [0.0, 1.0], np.ones(1), [history])
+    assert not flight.arrived
+    assert flight.t[-1] <= 0.5
+    assert "singular" in flight.message
+
+
 def test_a_flight_into_a_singularity_ends_with_a_message():
     history = approximate(lambda t: np.zeros((len(t), 1)), 0.0, 2.0)
     flight = fly(lambda t, y, k: y * y, [0.0, 2.0], np.ones(1), [history], most_steps=300)

@@ -1,13 +1,20 @@
 """A journal gives a solve back what it had computed; with nothing in it, resuming is an error."""
 
+import json
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import helpers
 import pytest
 import torch
 from helpers import problem
 
-from ponn_torch.ansatz.basis import Chebyshev
+from ponn_torch.ansatz.basis import Chebyshev, RandomFeatures
 from ponn_torch.optim.base import Status
 from ponn_torch.solving.continuation import Ladder
-from ponn_torch.solving.journal import Journal
+from ponn_torch.solving.journal import ForeignJournal, Journal
 from ponn_torch.solving.observer import Observer
 from ponn_torch.solving.solver import Solver
 
@@ -46,7 +53,7 @@ def test_a_solve_is_taken_up_where_it_was_interrupted(stop, tmp_path):
 
 def test_what_was_finished_is_not_computed_again(tmp_path):
     SMALL.solve(problem("mars_landing"), 0, None, Journal(tmp_path))
-    assert len(list(tmp_path.iterdir())) == 3
+    assert len(list(tmp_path.glob("*.npz"))) == 3
 
     class Broken:
         def run(self, *_):
@@ -58,9 +65,59 @@ def test_what_was_finished_is_not_computed_again(tmp_path):
         assert result.n_iterations > 0
 
 
+MADE = problem("mars_landing")
+
+
+@pytest.mark.parametrize(
+    ("named", "other"),
+    [
+        ("seed", (SMALL, MADE, 5)),
+        ("problem", (SMALL, helpers.PROBLEMS["mars_landing"](gravity=1.62), 0)),
+        ("problem", (SMALL, replace(MADE, dynamics=lambda t, x, u, p: MADE.dynamics(t, x, u, p)), 0)),
+        ("basis", (replace(SMALL, basis=Chebyshev(13)), MADE, 0)),
+        ("continuation", (replace(SMALL, continuation=Ladder((1.0,))), MADE, 0)),
+    ],
+)
+def test_a_journal_goes_on_with_its_own_solve_only(named, other, tmp_path):
+    SMALL.solve(MADE, 0, Watching(14), Journal(tmp_path))
+    assert (tmp_path / "000.npz").is_file()
+    solver, *stated = other
+    with pytest.raises(ForeignJournal, match=f"other values of {named};"):
+        solver.solve(*stated, None, Journal(tmp_path, resume=True))
+    solver.solve(*stated, Watching(2), Journal(tmp_path))  # begun anew, it belongs to that one
+    assert [path.name for path in tmp_path.glob("*.npz")] == ["000_under_way.npz"]
+    solver.solve(*stated, Watching(2), Journal(tmp_path, resume=True))
+
+
+DIGESTS = """
+import json, sys
+sys.path.insert(0, {tests!r})
+from helpers import problem
+from ponn_torch.ansatz.basis import RandomFeatures
+from ponn_torch.solving.solver import Solver
+print(json.dumps(Solver(RandomFeatures(9)).determined_by(problem("earth_mars"), 3)))
+"""
+
+
+def test_what_determines_a_solve_is_the_same_in_a_fresh_process():
+    """Other hashes, other addresses, the same digests."""
+    run = [sys.executable, "-c", DIGESTS.format(tests=str(Path(helpers.__file__).parent))]
+    told = subprocess.run(run, capture_output=True, text=True, check=True).stdout
+    assert json.loads(told) == Solver(RandomFeatures(9)).determined_by(problem("earth_mars"), 3)
+
+
 class Anything:
     def residual(self, xi):
         return xi
+
+
+def test_a_budget_that_is_spent_by_what_was_finished_ends_the_solve(tmp_path):
+    SMALL.solve(problem("mars_landing"), 0, Watching(14), Journal(tmp_path))
+    result = replace(SMALL, cpu_seconds=1e-9).solve(problem("mars_landing"), 0, None, Journal(tmp_path, resume=True))
+    assert result.spent
+    assert [stage.status for stage in result.stages] == [Status.BUDGET]
+    assert result.solution is not None
+    assert "CPU time" in result.message
 
 
 def test_a_resume_that_finds_nothing_is_an_error(tmp_path):

@@ -20,7 +20,7 @@ from ponn_torch.optimal_control.control_laws import Regime
 from ponn_torch.optimal_control.curve import Curve
 from ponn_torch.optimal_control.discretisation import Discretisation
 from ponn_torch.solving.guess import RandomGuess, project
-from ponn_torch.solving.refinement import Outcome, Refined, Subdivide, shared_out
+from ponn_torch.solving.refinement import Outcome, Refined, Rounds, Subdivide, shared_out
 from ponn_torch.solving.sharpening import legible
 from ponn_torch.solving.solution import Solution
 from ponn_torch.solving.split import MOVED, Split, _Search
@@ -96,10 +96,10 @@ def test_what_s_was_not_content_with_is_not_taken_up_again_from_a_sharper_curve(
     """Repairs follow from the solved curve alone, wherever it was reached from."""
     start = smoothed("earth_mars", 1.0)
     structure = find_structure(start)  # three arcs of five
-    search = _Search(Split().discretisation(start.collocation.bvp), None)
+    search = _Search(Split().discretisation(start.collocation.bvp), Rounds(start))
     assert Split(max_rounds=1)._split(search, start, structure, 8).outcome is Outcome.STRUCTURE
     assert Split()._split(search, start, structure, 8).outcome is Outcome.STRUCTURE
-    assert len(search.rounds) == 2
+    assert len(search.rounds.results) == 2
     assert Split()._split(search, start, structure, 9).outcome is Outcome.SOLVED  # other segments are another chance
 
 
@@ -112,7 +112,7 @@ class Unlucky(Split):
 
     def _split(self, search, curve, structure, n_segments):
         self.tried.append((structure, n_segments))
-        return Refined(curve, Outcome.RESIDUAL, search.rounds)
+        return Refined(curve, Outcome.RESIDUAL, search.rounds.results)
 
 
 def test_arcs_that_were_not_solved_are_tried_again_once_a_sharper_curve_has_moved_their_switches():

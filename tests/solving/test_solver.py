@@ -14,13 +14,16 @@ from helpers import PROBLEMS, PROBLEMS_WITH_ANSWERS, bvp_of, collocation, mass_v
 
 from ponn_torch.ansatz.basis import Chebyshev, Legendre, RandomFeatures
 from ponn_torch.optim.base import Status, Stopping
+from ponn_torch.optim.chain import Chain, OutputLayer
 from ponn_torch.optim.least_squares import LevenbergMarquardt
+from ponn_torch.optim.weighted import WeightedEquations
 from ponn_torch.optimal_control.control_laws import Box, Unconstrained
 from ponn_torch.optimal_control.curve import Curve
 from ponn_torch.optimal_control.pontryagin import pontryagin
 from ponn_torch.optimal_control.problem import FreeTime, OptimalControlProblem
 from ponn_torch.problems.boundary_layer import boundary_layer, exact_cost
 from ponn_torch.problems.earth_mars import EARTH_VENUS
+from ponn_torch.solving import split
 from ponn_torch.solving.certificate import certify
 from ponn_torch.solving.continuation import Adaptive, Ladder, Phases, Single
 from ponn_torch.solving.guess import RandomGuess, project
@@ -30,6 +33,7 @@ from ponn_torch.solving.refinement import Subdivide
 from ponn_torch.solving.result import SolveResult
 from ponn_torch.solving.solution import Solution
 from ponn_torch.solving.solver import Solver
+from ponn_torch.solving.split import Split
 
 DAY = 86400.0
 AU, SUN_GM = 149.59787e9, 1.32712440018e20
@@ -532,6 +536,51 @@ def test_an_interrupted_solve_keeps_what_it_had(stage):
     assert result.solution is observer.reported is not None
 
 
+def test_an_interrupted_solve_keeps_its_best_stage():
+    """Not the one that was cut, as long as that is worse than the one before."""
+    solver = Solver(continuation=Ladder((1.0, 0.1)))
+    result = solver.solve(problem("earth_mars"), 0, Interrupting("smooth", 0.1))
+    first, cut = result.stages
+    assert cut.status is Status.INTERRUPTED
+    assert cut.norm > first.norm
+    assert result.solution is first.solution
+
+
+def test_an_interrupt_between_the_rounds_of_a_refinement_keeps_them(monkeypatch):
+    def interrupt(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(split, "needles", interrupt)
+    result = Solver().solve(problem("mars_landing"))
+    assert result.interrupted
+    assert result.stages[-1].name == "split"
+    assert result.stages[-1].norm < Split().residual_tolerance
+    assert result.solution is result.stages[-1].solution
+    assert result.solution.kind == "split"
+
+
+@pytest.mark.parametrize("refinement", [Split(), Subdivide()])
+def test_a_residual_that_is_not_finite_between_the_nodes_fails_the_refinement(refinement):
+    def dynamics(t, x, u, p):  # of no real number within a millisecond of t = 1 s
+        return {"r": x.v, "v": u.a + 1e-3 * x.r * torch.sqrt((t - 1.0) ** 2 - 1e-6)}
+
+    made = OptimalControlProblem(
+        name="gap",
+        states={"r": 1, "v": 1},
+        control=Unconstrained("a", 1),
+        dynamics=dynamics,
+        running_cost=lambda t, x, u, p: u.a**2,
+        initial={"r": 0.0, "v": 0.0},
+        final={"r": 1.0, "v": 0.0},
+        final_time=2.0,
+    )
+    result = Solver(n_starts=1, refinement=refinement).solve(made)
+    assert not result.certified
+    assert "the residual did not fall below its tolerance" in result.message
+    assert Status.NON_FINITE in [stage.status for stage in result.stages]
+    assert result.solution is not None
+
+
 @pytest.mark.parametrize(("reads", "stages"), [(1, 1), (80, 3)])
 def test_a_budget_ends_a_solve_that_keeps_what_it_had(monkeypatch, reads, stages):
     """By a clock that counts how often it is read, so that every machine spends it at the same place."""
@@ -589,10 +638,32 @@ def test_a_problem_of_ones_own_takes_a_few_lines():
     assert len(pontryagin(swing).chains) == 2  # angle and rate, and their costates
 
 
-def test_stages_that_lead_to_a_split_end_early_and_others_do_not():
+def test_single_precision_is_for_what_is_not_certified():
+    for refinement in (Split(), Subdivide()):
+        name = type(refinement).__name__
+        with pytest.raises(ValueError, match=f"dtype = float32 with refinement = {name}; allowed: float64, or float32"):
+            Solver(refinement=refinement, dtype=torch.float32)
+    result = Solver(refinement=None, dtype=torch.float32, n_starts=1).solve(problem("minimum_energy"))
+    assert result.solution.curve.xi.dtype is torch.float32
+
+
+def test_where_nothing_aims_at_a_certificate_one_start_is_enough():
+    solver = Solver(continuation=Single(1.0), refinement=None, n_certified=3)
+    assert solver.solve(problem("mars_landing")).n_starts == 1
+
+
+OPTIMIZER = Solver().optimizer
+
+
+@pytest.mark.parametrize(
+    "optimizer",
+    [OPTIMIZER, WeightedEquations(OPTIMIZER, {"v_1": 2.0}), Chain([OPTIMIZER, OutputLayer()])],
+    ids=["alone", "weighted", "in a chain"],
+)
+def test_stages_that_lead_to_a_split_end_early_and_others_do_not(optimizer):
     fuel = problem("mars_landing")
-    split = Solver(continuation=Single(1.0)).solve(fuel, 0)
-    alone = Solver(continuation=Single(1.0), refinement=None).solve(fuel, 0)
+    split = Solver(continuation=Single(1.0), optimizer=optimizer).solve(fuel, 0)
+    alone = Solver(continuation=Single(1.0), optimizer=optimizer, refinement=None).solve(fuel, 0)
     assert split.certified
     assert 1e-6 < split.stages[0].norm < 1e-4
     assert alone.stages[0].norm < 1e-6
