@@ -201,7 +201,8 @@ class Unconstrained:
 
     def minimise(self, h: Hamiltonian, p: Any, like: Tensor, regime: Regime) -> Minimiser:
         at_zero, hessian = self._parabola(h, like)
-        u = -torch.linalg.solve(hessian, at_zero.unsqueeze(-1)).squeeze(-1)
+        # where H_uu is singular u is not finite, and an iteration that comes there steps back
+        u = -torch.linalg.solve_ex(hessian, at_zero.unsqueeze(-1)).result.squeeze(-1)
         none = like[..., :0]
         return Minimiser({self.name: u}, none, none)
 

@@ -116,14 +116,9 @@ class Run:
             interrupted, message = True, "interrupted; the best stage so far is kept"
         if best is not None and best[1].certified and not interrupted:
             message = verdict if n_certified == 1 else f"{verdict}; the cheapest of {n_certified} certified starts"
-        if not n_certified and not interrupted and len(self.causes) > 1:
-            tally = ", ".join(f"{count} × {cause}" for cause, count in Counter(self.causes).most_common())
-            message = f"{message}; of {len(begun)} starts: {tally}"
-        if not n_certified and (hint := self.problem.scaling_hint()):
-            message = f"{message}; {hint}"
         spent = self.clock.spent and n_certified < self.solver.n_certified
-        if spent and not (best and best[1].certified) and Status.BUDGET.value not in message:
-            message = f"{Status.BUDGET.value}: {message}"
+        if not n_certified and not interrupted:
+            message = self._of_all(message, len(begun))
         solution = best[0] if best else self._best_stage()
         if solution is not None:
             self.observer.solution(solution)
@@ -134,6 +129,16 @@ class Run:
         certificate = best[1] if best else None
         seconds = self.clock.seconds
         return SolveResult(solution, certificate, self.stages, max(1, len(begun)), message, seconds, interrupted, spent)
+
+    def _of_all(self, message: str, n_starts: int) -> str:
+        """The message of a failure, with what there is to say of all starts."""
+        said = [message]
+        if len(self.causes) > 1:
+            tally = ", ".join(f"{count} × {cause}" for cause, count in Counter(self.causes).most_common())
+            said.append(f"of {n_starts} starts: {tally}")
+        said.append(self.problem.scaling_hint())
+        text = "; ".join(part for part in said if part)
+        return text if not self.clock.spent or Status.BUDGET.value in text else f"{Status.BUDGET.value}: {text}"
 
     def _guessed(self, start: int) -> tuple[Collocation, Tensor]:
         """The collocation of the first stage, and a start's guess projected on it."""

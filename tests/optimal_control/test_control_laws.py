@@ -485,3 +485,10 @@ def test_a_hamiltonian_convex_at_some_probes_is_left_to_the_certificate():
     signs = tensor([[1.0], [0.0], [-1.0], [-1.0]])
     law = Unconstrained("u", 1)
     assert adapted(law, lambda u: signs * u**2 + u, None) is law
+
+
+def test_where_h_does_not_depend_on_the_control_there_is_no_minimiser_and_no_error():
+    weight = torch.tensor([[1.0], [0.0]], dtype=torch.float64)
+    best = Unconstrained("u", 1).minimise(lambda u: weight * u**2 + u, None, weight, Regime())
+    assert best.control["u"][0] == pytest.approx(-0.5)
+    assert not bool(best.control["u"][1].isfinite())

@@ -12,9 +12,11 @@ from torch import Tensor
 from ponn_torch.numerics.nodes import differentiation_matrix, make_nodes
 from ponn_torch.optimal_control.boundary_value_problem import BoundaryValueProblem
 from ponn_torch.optimal_control.collocation import Collocation
+from ponn_torch.optimal_control.control_laws import Unconstrained
 from ponn_torch.optimal_control.curve import Curve
 from ponn_torch.optimal_control.pontryagin import pontryagin
-from ponn_torch.solving.guess import DISTRIBUTIONS, RandomGuess, project
+from ponn_torch.optimal_control.problem import OptimalControlProblem
+from ponn_torch.solving.guess import DISTRIBUTIONS, STREAMS, Alternating, RandomGuess, project
 from ponn_torch.solving.paths import PolarTransfer, PoweredDescent, StraightLine
 
 # -- projection ----------------------------------------------------------------------------------------------
@@ -234,10 +236,50 @@ def test_a_backward_orbit_turns_backward():
     assert float(steps.sum()) == pytest.approx(-1.5 * math.pi, rel=1e-9)
 
 
+def test_a_transfer_in_a_plane_is_the_one_in_space_without_height():
+    def orbit(size: int) -> BoundaryValueProblem:
+        def ends(x: float, y: float) -> list[float]:
+            return [x, y, 0.0][:size]
+
+        made = OptimalControlProblem(
+            name="orbit",
+            states={"r": size, "v": size},
+            control=Unconstrained("a", size),
+            dynamics=lambda t, x, u, p: {"r": x.v, "v": u.a - x.r / (x.r**2).sum(-1, keepdim=True) ** 1.5},
+            running_cost=lambda t, x, u, p: (u.a**2).sum(-1, keepdim=True),
+            initial={"r": ends(1.0, 0.0), "v": ends(0.0, 1.0)},
+            final={"r": ends(0.0, 1.5), "v": ends(-0.8, 0.0)},
+            final_time=3.0,
+        )
+        return pontryagin(made)
+
+    t = torch.linspace(0, 3, 9, dtype=torch.float64)
+    plane, space = (PolarTransfer(1).curve(orbit(size), 0)(t) for size in (2, 3))
+    # third derivatives of the path lose digits
+    torch.testing.assert_close(plane, space[:, [0, 1, 3, 4, 6, 7, 9, 10]], rtol=1e-10, atol=1e-10)
+
+
+def test_starts_alternate_between_guesses_and_pass_over_one_that_does_not_fit():
+    guess = Alternating((RandomGuess(), PolarTransfer()))
+    for name, second in (("earth_mars", PolarTransfer()), ("mars_landing", RandomGuess())):  # which ends on the axis
+        bvp = bvp_of(name)
+        t = torch.linspace(0, 1, 5, dtype=torch.float64) * bvp.final_time
+        for start, expected in ((0, RandomGuess()), (1, second), (2, RandomGuess())):
+            stream = 7 * STREAMS + start
+            assert torch.equal(guess.curve(bvp, stream)(t), expected.curve(bvp, stream)(t))
+
+
+def test_where_no_guess_fits_the_last_reason_is_told():
+    with pytest.raises(ValueError, match="guess needs a state 'r'"):
+        Alternating((PolarTransfer(), StraightLine())).curve(bvp_of("minimum_energy"), 0)
+
+
 @pytest.mark.parametrize(
     ("make", "message"),
     [
         (lambda: RandomGuess("gaussian"), "distribution = 'gaussian'; allowed: uniform, symmetric, normal"),
+        (lambda: Alternating(()), "guesses: none given; allowed: at least one"),
+        (lambda: PolarTransfer().curve(bvp_of("mars_landing"), 0), "a polar transfer needs ends off the z axis"),
         (lambda: PolarTransfer(-1), "revolutions = -1; allowed: 0, 1, 2"),
         (lambda: PolarTransfer([2, -1]), r"revolutions = \[2, -1\]; allowed: 0, 1, 2"),
         (lambda: PolarTransfer([]), r"revolutions = \[\]; allowed: 0, 1, 2"),

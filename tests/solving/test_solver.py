@@ -23,14 +23,16 @@ from ponn_torch.optimal_control.pontryagin import pontryagin
 from ponn_torch.optimal_control.problem import FreeTime, OptimalControlProblem
 from ponn_torch.problems.boundary_layer import boundary_layer, exact_cost
 from ponn_torch.problems.earth_mars import EARTH_VENUS
+from ponn_torch.problems.mars_landing import mars_landing
 from ponn_torch.solving import split
 from ponn_torch.solving.certificate import certify
 from ponn_torch.solving.continuation import Adaptive, Ladder, Phases, Single
 from ponn_torch.solving.guess import RandomGuess, project
 from ponn_torch.solving.observer import Observer
 from ponn_torch.solving.paths import PolarTransfer
-from ponn_torch.solving.refinement import Subdivide
+from ponn_torch.solving.refinement import MORE_NEURONS, Subdivide
 from ponn_torch.solving.result import SolveResult
+from ponn_torch.solving.run import MOST_REPEATS, SAME
 from ponn_torch.solving.solution import Solution
 from ponn_torch.solving.solver import Solver
 from ponn_torch.solving.split import Split
@@ -687,3 +689,48 @@ def test_components_that_switch_together_share_a_knot():
     assert result.solution.curve.collocation.events.count((0, 1)) == 1
     assert result.solution.switch_times == pytest.approx([1.0], abs=1e-10)
     assert result.solution.cost == pytest.approx(2.0, abs=1e-10)
+
+
+def test_what_misses_its_certificate_is_solved_once_more_with_more_neurons():
+    coarse = Split(n_neurons=5, n_nodes=9, off_node_tolerance=1e-2)
+    result = Solver(refinement=coarse).solve(problem("mars_landing"))
+    assert result.certified, result.message
+    first, second = (stage for stage in result.stages if stage.name == "split")
+    assert not certify(first.solution).certified
+    sizes = [stage.solution.curve.collocation.discretisation.basis.size for stage in (first, second)]
+    assert sizes == [5, 5 + MORE_NEURONS]
+
+
+def test_a_stage_that_missed_its_tolerance_is_not_the_only_one_that_arcs_are_read_from():
+    """A landing in 1.1 % more than its least time: at ρ = 0.3 no single polynomial is near, and S asks for full thrust."""
+    made = mars_landing(
+        initial_position=(-815.4000008650653, 854.3338708031822, 2219.934314659),
+        initial_velocity=(-57.32648663769094, 28.57869400586945, -79.18515824347733),
+        mass_flow_per_thrust=5.0863e-4,
+        final_time=44.615322354471594,
+    )
+    result = Solver(n_starts=1).solve(made)
+    assert result.certified, result.message
+    assert result.solution.cost == pytest.approx(296.588115, abs=1e-5)  # as direct collocation has it
+    assert result.solution.arcs == ["max", "min", "max"]
+
+
+def test_starts_take_their_number_of_segments_in_turn():
+    result = Solver(n_segments=(1, 3), n_starts=2, start_limit=1e-300, continuation=Single()).solve(
+        problem("earth_mars")
+    )
+    assert [stage.solution.curve.collocation.n_segments for stage in result.stages] == [1, 3]
+    assert "of 2 starts: 2 × not through the first stages" in result.message
+    with pytest.raises(ValueError, match="n_segments = \\(1, 0\\); allowed: at least 1, or a list of such numbers"):
+        Solver(n_segments=(1, 0))
+
+
+def test_starts_that_lead_where_others_led_before_end_the_search():
+    hopeless = Split(max_rounds=1, max_sharpenings=0)
+    blunt = Ladder((1.0,))  # at which Earth–Mars shows three arcs of five
+    result = Solver(refinement=hopeless, continuation=blunt, guess=RandomGuess(), n_segments=1).solve(
+        problem("earth_mars")
+    )
+    assert not result.certified
+    assert result.n_starts < Solver().n_starts
+    assert f"{MOST_REPEATS} × {SAME}" in result.message
