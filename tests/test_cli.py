@@ -257,7 +257,10 @@ def test_what_an_own_problem_states_wrongly_is_told_with_its_line(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     for bound, told in (
-        ("[1.0]", "my problem.py:29: force: maximum = [1.0]; allowed: a finite number"),
+        (
+            "[1.0,2.0]",
+            "my problem.py:29: force: maximum = (1.0, 2.0); allowed: a finite number, one for every component",
+        ),
         ("'1'", "my problem.py:26: maximum of the control = '1'; allowed: a number"),
     ):
         assert main([f"problem={own_problem}:pushed", f"problem.arguments.bound={bound}"]) == 1

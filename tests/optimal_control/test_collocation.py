@@ -156,21 +156,21 @@ def test_smoothed_segments_with_parameters_explicit_time_and_terminal_data(name,
 @pytest.mark.parametrize("mass_variable", ["mass", "log_mass", "delta_v"])
 def test_arcs_with_unknown_switches_and_subdivisions(mass_variable, free_final_time, form):
     bvp = pontryagin(ferry(free_final_time=free_final_time), mass_variable=mass_variable)
-    made = on_times(bvp, [0, 0.2, 0.5, 0.6, 0.8, 1.0], [None, 0, None, 0], [[2], [2], [0], [0], [2]], FORMS[form])
+    made = on_times(bvp, [0, 0.2, 0.5, 0.6, 0.8, 1.0], [None, (0,), None, (0,)], [[2], [2], [0], [0], [2]], FORMS[form])
     assert len(made.free_times) == 2 + free_final_time
     assert jacobian_error(made, unknowns(made)) < 1e-11
 
 
 @pytest.mark.parametrize("name", ["mars_landing", "tfc_test_1", "earth_mars", "minimum_time", "minimum_fuel"])
 def test_arcs_of_published_problems(name):
-    made = on_times(bvp_of(name), [0, 0.3, 0.7, 1.0], [0, 0], [[2], [0], [2]])
+    made = on_times(bvp_of(name), [0, 0.3, 0.7, 1.0], [(0,), (0,)], [[2], [0], [2]])
     assert jacobian_error(made, unknowns(made)) < 1e-11
 
 
 def test_arcs_of_a_box_that_saturates_by_component():
     bvp = pontryagin(saturated_pair())
     # functions 0 and 1 are S at the lower bound, 2 and 3 at the upper one
-    made = on_times(bvp, [0, 0.3, 0.5, 1.0], [2, 1], [[2, 1], [1, 1], [1, 0]])
+    made = on_times(bvp, [0, 0.3, 0.5, 1.0], [(2,), (1,)], [[2, 1], [1, 1], [1, 0]])
     assert jacobian_error(made, unknowns(made)) < 1e-11
 
 
@@ -236,7 +236,7 @@ def test_a_batch_of_smoothings_and_parameters(free_final_time):
 def test_a_batch_of_ends_and_durations(arcs):
     bvp = pontryagin(ferry())
     if arcs:
-        made = on_times(bvp, [0, 0.25, 0.5, 1.0], [None, 0], [[2], [2], [0]])
+        made = on_times(bvp, [0, 0.25, 0.5, 1.0], [None, (0,)], [[2], [2], [0]])
     else:
         made = collocation(bvp, n_neurons=4, n_nodes=6, n_segments=2, smoothing=0.3)
     ends = 0.1 * random(3, *made.known_knots.shape, seed=5)
@@ -250,14 +250,14 @@ def test_a_batch_of_ends_and_durations(arcs):
 
 
 def test_a_batch_of_parameters_on_arcs_with_switching_rows():
-    made = on_times(pontryagin(ferry(free_final_time=True)), [0, 0.4, 1.0], [0], [[2], [0]])
+    made = on_times(pontryagin(ferry(free_final_time=True)), [0, 0.4, 1.0], [(0,)], [[2], [0]])
     thrust = torch.tensor([[4.0, 5.0], [3.0, 2.0]], dtype=torch.float64)
     members = [made.with_setting(thrust=float(value)) for value in thrust.flatten()]
     check_members(made.with_setting(thrust=thrust), members, unknowns(made, (2, 2)))
 
 
 def test_a_batch_of_arc_codes():
-    made = on_times(pontryagin(ferry()), [0, 0.4, 1.0], [0], [[2], [0]])
+    made = on_times(pontryagin(ferry()), [0, 0.4, 1.0], [(0,)], [[2], [0]])
     codes = torch.tensor([[[2], [0]], [[0], [2]]])
     members = [with_arcs(made, codes[i].tolist()) for i in range(2)]
     check_members(with_arcs(made, codes.tolist()), members, unknowns(made, (2,)))
@@ -292,7 +292,7 @@ def test_chains_save_unknowns():
 
 @pytest.mark.parametrize("name", ["earth_mars", "tfc_test_1"])
 def test_blocks_part_the_residual(name):
-    made = on_times(bvp_of(name), [0, 0.3, 0.7, 1.0], [0, 0], [[2], [0], [2]])
+    made = on_times(bvp_of(name), [0, 0.3, 0.7, 1.0], [(0,), (0,)], [[2], [0], [2]])
     r = made.residual(unknowns(made, (2,)))
     blocks = made.blocks(r)
     assert set(blocks) <= {*component_names(made.bvp), "switching", "terminal"}
@@ -303,7 +303,7 @@ def test_blocks_part_the_residual(name):
 
 
 def test_subdivisions_stay_at_their_fraction_between_switches():
-    made = on_times(pontryagin(ferry(free_final_time=True)), [0, 0.2, 0.5, 0.8, 1.0], [None, 0, None], [[2]] * 4)
+    made = on_times(pontryagin(ferry(free_final_time=True)), [0, 0.2, 0.5, 0.8, 1.0], [None, (0,), None], [[2]] * 4)
     xi = unknowns(made)
     parts = made.unpack(xi)
     switch, end = 1.1 * float(parts.times[2]), 1.3 * float(parts.times[4])
@@ -375,7 +375,7 @@ def test_the_linear_quadratic_regulator_is_a_hyperbolic_cosine(n_segments, chain
 
 def test_an_exact_extremal_makes_every_row_vanish_and_no_other_curve_does():
     """minimum fuel over 3 s: push, coast, brake with λv = 1 at the switches, split where S = 0."""
-    made = on_times(bvp_of("minimum_fuel"), [0, 0.2, 0.7, 1.0], [0, 0], [[2], [0], [2]])
+    made = on_times(bvp_of("minimum_fuel"), [0, 0.2, 0.7, 1.0], [(0,), (0,)], [[2], [0], [2]])
     push = 1.5 - math.sqrt(1.25)
     slope = 2 / (3 - 2 * push)  # of λv, from −1 to 1 over the coast
 

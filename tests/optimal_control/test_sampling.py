@@ -38,7 +38,7 @@ def test_a_box_is_sampled_up_to_its_bounds_and_about_the_control(size):
 @pytest.mark.parametrize("size", [1, 2, 3])
 def test_a_thrust_ball_is_sampled_in_all_directions_with_vectors_as_long_as_they_say(size, low):
     law = ThrustBall("T", "most", low, size=size)
-    bound = law.bounds(LIMITS)[0]
+    bound = law.bounds(LIMITS, torch.zeros((), dtype=torch.float64))[0]
     magnitude = bound + (6 - bound) * ETA
     axis = torch.eye(size, dtype=torch.float64)[-1]
     given = {"T": -magnitude * axis, "T_magnitude": magnitude}

@@ -702,7 +702,7 @@ def test_what_misses_its_certificate_is_solved_once_more_with_more_neurons():
 
 
 def test_a_stage_that_missed_its_tolerance_is_not_the_only_one_that_arcs_are_read_from():
-    """A landing in 1.1 % more than its least time: at ρ = 0.3 no single polynomial is near, and S asks for full thrust."""
+    """A landing in 1.1 % more than its least time: at ρ = 0.3 no single polynomial is near, and S shows one arc."""
     made = mars_landing(
         initial_position=(-815.4000008650653, 854.3338708031822, 2219.934314659),
         initial_velocity=(-57.32648663769094, 28.57869400586945, -79.18515824347733),
