@@ -12,7 +12,7 @@ from ponn_torch.baselines.transcription import Answer, Program
 from ponn_torch.numerics.nodes import interpolation_matrix
 from ponn_torch.optimal_control.boundary_value_problem import BoundaryValueProblem, Setting
 from ponn_torch.optimal_control.collocation import Collocation
-from ponn_torch.optimal_control.control_laws import Regime
+from ponn_torch.optimal_control.control_set import Regime
 from ponn_torch.optimal_control.curve import Curve
 from ponn_torch.optimal_control.pontryagin import pontryagin
 from ponn_torch.optimal_control.problem import OptimalControlProblem

@@ -9,7 +9,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from ponn_torch.optimal_control.control_laws import LOWER, UPPER, Box, ControlSet, ThrustBall, Unconstrained
+from ponn_torch.optimal_control.control_laws import Box, ThrustBall, Unconstrained
+from ponn_torch.optimal_control.control_set import LOWER, UPPER, ControlSet
 from ponn_torch.optimal_control.problem import Named, OptimalControlProblem
 
 

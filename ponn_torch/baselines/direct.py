@@ -20,7 +20,7 @@ from ponn_torch.baselines.answer import DirectSolution
 from ponn_torch.baselines.transcription import Answer, Array, PathConstraints, Phase, Point, Program
 from ponn_torch.optim.base import Stopwatch
 from ponn_torch.optimal_control.boundary_value_problem import Setting
-from ponn_torch.optimal_control.control_laws import LOWER, UPPER, Regime
+from ponn_torch.optimal_control.control_set import LOWER, UPPER, Regime
 from ponn_torch.optimal_control.pontryagin import pontryagin
 from ponn_torch.optimal_control.problem import OptimalControlProblem
 from ponn_torch.solving.guess import Guess
@@ -137,7 +137,7 @@ class TwoStage:
         """The last round's answer; ``solved`` says whether IPOPT was content and S agrees with every arc."""
         best = self.first.solve(problem)
         bvp = pontryagin(problem, mass_variable="mass", chains=False)
-        if not best.solved or bvp.law.n_switching == 0 or bvp.law.curved:
+        if not best.solved or not bvp.law.jumps:
             return best
         iterations, seconds, build = best.n_iterations, best.cpu_seconds, best.build_seconds
         codes, durations = _arcs_by_fraction(best)

@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from ponn_torch.numerics.autodiff import differentiable, gradients_and_values, pointwise_jacobian
-from ponn_torch.optimal_control.control_laws import ControlSet, Minimiser, Regime
+from ponn_torch.optimal_control.control_set import ControlSet, Minimiser, Regime
 from ponn_torch.optimal_control.meaning import meaning
 from ponn_torch.optimal_control.problem import Named, OptimalControlProblem
 

@@ -21,7 +21,7 @@ from ponn_torch.numerics.autodiff import row_gradients
 from ponn_torch.numerics.linalg import ArrowJacobian, DenseJacobian, Jacobian
 from ponn_torch.numerics.tape import recordable
 from ponn_torch.optimal_control.boundary_value_problem import BoundaryValueProblem, Setting
-from ponn_torch.optimal_control.control_laws import Regime
+from ponn_torch.optimal_control.control_set import Regime
 from ponn_torch.optimal_control.discretisation import Discretisation
 from ponn_torch.optimal_control.linearisation import linearise
 from ponn_torch.optimal_control.problem import nearest

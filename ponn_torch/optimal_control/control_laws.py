@@ -1,8 +1,6 @@
 """Minimisers of the Hamiltonian over a control set, smoothed by a regulariser or pinned to an arc.
 
-A control set sees the Hamiltonian only as a function of its control, ``h(**control) -> (..., 1)``, at a fixed time,
-state and costate. It answers with the minimiser and with its *switching functions*: the scalars whose zeros separate
-the arcs. A bounded scalar control is written lower + (upper − lower) η with η ∈ [0, 1], and S = −(∂H/∂η)/s with s a
+A bounded scalar control is written lower + (upper − lower) η with η ∈ [0, 1], and S = −(∂H/∂η)/s with s a
 constant in cost per time. Three regimes:
 
 - smoothed, H affine in η: ``s ρ e(η)`` is added to the running cost, so the minimum principle stays exact at every ρ;
@@ -13,39 +11,26 @@ constant in cost per time. Three regimes:
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import KW_ONLY, dataclass, field, replace
-from typing import Any, ClassVar, NamedTuple, Protocol
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
 
 from ponn_torch.numerics.autodiff import gradients
 from ponn_torch.optimal_control import sampling
+from ponn_torch.optimal_control.control_set import (
+    LOWER,
+    UPPER,
+    ControlSet,
+    Hamiltonian,
+    Minimiser,
+    Regime,
+    Unbounded,
+    finite,
+)
 from ponn_torch.optimal_control.regularisers import Entropy, Regulariser
-
-Hamiltonian = Callable[..., Tensor]
-
-LOWER, INTERIOR, UPPER = 0, 1, 2  # codes of an arc
-
-
-class Minimiser(NamedTuple):
-    """What a control set answers: the control by name, S (..., m) and the fraction η (..., m) of its range."""
-
-    control: dict[str, Tensor]
-    switching: Tensor
-    fraction: Tensor
-
-
-# -- one bounded scalar ----------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class Regime:
-    """How a bounded control is chosen: smoothed by ρ (..., 1), or pinned to arc codes (..., m)."""
-
-    smoothing: Tensor | None = None
-    arcs: Tensor | None = None
 
 
 def _fraction(at_lower: Tensor, at_upper: Tensor, curved: bool, law: Bounded, regime: Regime) -> Tensor:
@@ -72,14 +57,6 @@ SHARE = 0.37  # of a range; no symmetry favours it
 ROUNDING = 1e-9  # of a slope
 
 
-def finite(value: Any) -> bool:
-    """Whether a value is one finite number; text and arrays are none."""
-    try:
-        return math.isfinite(value)
-    except (TypeError, ValueError, RuntimeError):  # what is no number; what is several; torch's word for the same
-        return False
-
-
 def _random(like: Tensor, size: int, seed: int = 0) -> Tensor:
     """The same numbers (..., size) in (−1, 1) every time; ``like`` is (..., 1)."""
     generator = torch.Generator().manual_seed(seed)
@@ -103,58 +80,8 @@ def _nowhere_convex(bend: Tensor, *slopes: Tensor) -> bool:
 # -- control sets ----------------------------------------------------------------------------------------------------
 
 
-class ControlSet(Protocol):
-    """The admissible controls and the minimiser of the Hamiltonian over them."""
-
-    @property
-    def names(self) -> dict[str, int]:
-        """Names and sizes of the controls that the dynamics read."""
-        ...
-
-    @property
-    def n_switching(self) -> int:
-        """Number of switching functions; 0 where the control has no bound."""
-        ...
-
-    @property
-    def curved(self) -> bool:
-        """Whether H is convex in the bounded control: every component then has two switching functions."""
-        ...
-
-    def probe(self, one: Tensor) -> dict[str, Tensor]:
-        """An admissible control with the batch shape of ``one`` (..., 1)."""
-        ...
-
-    def adapted(self, h: Hamiltonian, cost: Hamiltonian, p: Any, one: Tensor, unit: float) -> ControlSet:
-        """A copy that knows, from probes of H and of the running cost, whether H is curved and what s is.
-
-        ``h`` and ``cost`` take controls with the batch shape of ``one`` (2k, 1): k points, and these again with the
-        opposite costates. ``unit`` is the scale of H, in cost per time, where the running cost does not tell s.
-
-        Raises:
-            ValueError: H is not of a kind that the set minimises.
-        """
-        ...
-
-    def minimise(self, h: Hamiltonian, p: Any, like: Tensor, regime: Regime) -> Minimiser:
-        """Minimise h; ``like`` is any (..., 1) tensor of the right shape, ``p`` the problem's parameters."""
-        ...
-
-    def penalty(self, minimiser: Minimiser, p: Any, smoothing: Tensor) -> Tensor:
-        """What the regulariser adds to the running cost, (..., 1)."""
-        ...
-
-    def arc_codes(self, switching: Tensor) -> Tensor:
-        """Arc codes (..., m) that the minimum principle asks for, from the switching functions."""
-        ...
-
-    def samples(self, minimiser: Minimiser, p: Any) -> Minimiser:
-        """Other admissible controls, and their η, on a new first axis: far from the given one and near it."""
-        ...
-
-
 @dataclass(frozen=True)
-class Unconstrained:
+class Unconstrained(Unbounded):
     """Control in ℝᵐ with H quadratic in it: u = −H_uu⁻¹ H_u(0), exact in one step."""
 
     name: str
@@ -163,14 +90,6 @@ class Unconstrained:
     @property
     def names(self) -> dict[str, int]:
         return {self.name: self.size}
-
-    @property
-    def n_switching(self) -> int:
-        return 0
-
-    @property
-    def curved(self) -> bool:
-        return False
 
     def probe(self, one: Tensor) -> dict[str, Tensor]:
         return {self.name: one.expand(*one.shape[:-1], self.size)}
@@ -217,12 +136,6 @@ class Unconstrained:
         # H is quadratic, so a unit step in the gradient is a column of H_uu
         return at_zero, torch.stack([self._slope(h, zero + unit) - at_zero for unit in units], -1)
 
-    def penalty(self, minimiser: Minimiser, p: Any, smoothing: Tensor) -> Tensor:
-        return torch.zeros_like(smoothing)
-
-    def arc_codes(self, switching: Tensor) -> Tensor:
-        return torch.zeros_like(switching, dtype=torch.long)
-
     def samples(self, minimiser: Minimiser, p: Any) -> Minimiser:
         u = minimiser.control[self.name]
         size = u.abs().flatten(0, -2).amax(0)
@@ -234,7 +147,7 @@ Bound = float | str | Sequence[float]
 
 
 @dataclass(frozen=True)
-class Bounded:
+class Bounded(ControlSet):
     """What thrust balls and boxes share: bounds (numbers, or names of parameters), a regulariser, a scale.
 
     ``cost_rate`` is s per unit of control, in cost per time and control; found by a probe of H where it is None.

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from ponn_torch.optimal_control.boundary_value_problem import Setting
 from ponn_torch.optimal_control.collocation import Collocation, Unknowns
-from ponn_torch.optimal_control.control_laws import Regime
+from ponn_torch.optimal_control.control_set import Regime
 
 
 @dataclass(frozen=True, eq=False)

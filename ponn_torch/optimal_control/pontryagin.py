@@ -16,7 +16,7 @@ from torch import Tensor
 
 from ponn_torch.numerics.autodiff import gradients_and_values
 from ponn_torch.optimal_control.boundary_value_problem import BoundaryValueProblem, Chain, Setting
-from ponn_torch.optimal_control.control_laws import INTERIOR, LOWER, UPPER, ControlSet, Regime
+from ponn_torch.optimal_control.control_set import INTERIOR, LOWER, UPPER, ControlSet, Regime
 from ponn_torch.optimal_control.meaning import Keyed, meaning
 from ponn_torch.optimal_control.problem import Named, OptimalControlProblem, nearest
 
@@ -192,8 +192,7 @@ def probe_settings(bvp: BoundaryValueProblem, t: Tensor) -> list[Setting]:
         parameters[name] = value * (0.95 + 0.1 * share) if value else 1e-3 * share
     regimes = [Regime(smoothing=0.3 + t), Regime(smoothing=1e6 * (0.3 + t))]
     if bvp.law.n_switching:
-        n_bounded = bvp.law.n_switching // 2 if bvp.law.curved else bvp.law.n_switching
-        one = torch.ones(*t.shape[:-1], n_bounded, dtype=torch.long, device=t.device)
+        one = torch.ones(*t.shape[:-1], bvp.law.n_bounded, dtype=torch.long, device=t.device)
         regimes += [Regime(arcs=code * one) for code in (LOWER, INTERIOR, UPPER)]
     return [Setting(regime, parameters) for regime in regimes]
 

@@ -11,7 +11,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ponn_torch.optimal_control.control_laws import Bounded, ControlSet, finite
+from ponn_torch.optimal_control.control_laws import Bounded
+from ponn_torch.optimal_control.control_set import ControlSet, finite
 
 StateValues = Mapping[str, float | Sequence[float | None] | None]
 

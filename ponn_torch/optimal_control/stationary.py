@@ -18,11 +18,11 @@ from torch import Tensor
 
 from ponn_torch.numerics.autodiff import gradients, gradients_and_values
 from ponn_torch.optimal_control import sampling
-from ponn_torch.optimal_control.control_laws import Hamiltonian, Minimiser, Regime
+from ponn_torch.optimal_control.control_set import Hamiltonian, Minimiser, Regime, Unbounded
 
 
 @dataclass(frozen=True)
-class Stationary:
+class Stationary(Unbounded):
     """Control in ℝᵐ with minimum ≤ u_i ≤ maximum, at the global minimum of H; an angle by default.
 
     Where the smallest value of H lies on the edge of the range, the control stays there; H should be smooth inside.
@@ -52,14 +52,6 @@ class Stationary:
     @property
     def names(self) -> dict[str, int]:
         return {self.name: self.size}
-
-    @property
-    def n_switching(self) -> int:
-        return 0
-
-    @property
-    def curved(self) -> bool:
-        return False
 
     def probe(self, one: Tensor) -> dict[str, Tensor]:
         inside = self.minimum + 0.37 * (self.maximum - self.minimum)
@@ -101,12 +93,6 @@ class Stationary:
         step = self._solve(hessian, torch.where(held, torch.zeros_like(u), self._slope(h, u)))
         none = like[..., :0]
         return Minimiser({self.name: u - step}, none, none)
-
-    def penalty(self, minimiser: Minimiser, p: Any, smoothing: Tensor) -> Tensor:
-        return torch.zeros_like(smoothing)
-
-    def arc_codes(self, switching: Tensor) -> Tensor:
-        return torch.zeros_like(switching, dtype=torch.long)
 
     def samples(self, minimiser: Minimiser, p: Any) -> Minimiser:
         width = self.maximum - self.minimum

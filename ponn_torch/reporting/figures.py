@@ -117,7 +117,7 @@ def _control_axis(solution: Solution, ax: Axes, t: Tensor, name: str, samples: S
 
 def switching_labels(solution: Solution, n_switching: int) -> list[str]:
     """S, or one label per function: S at both bounds where H is curved, one per component of a box."""
-    curved = getattr(solution.bvp.law, "curved", False)
+    curved = solution.bvp.law.curved
     size = n_switching // 2 if curved else n_switching
     sides = (r"\min", r"\max") if curved else ("",)
     numbers = [str(i + 1) for i in range(size)] if size > 1 else [""]

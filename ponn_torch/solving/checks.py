@@ -11,7 +11,7 @@ from torch import Tensor
 
 from ponn_torch.numerics.autodiff import gradients
 from ponn_torch.optimal_control.boundary_value_problem import Setting
-from ponn_torch.optimal_control.control_laws import INTERIOR, Regime
+from ponn_torch.optimal_control.control_set import INTERIOR, Regime
 from ponn_torch.solving.flight import Flight, arc_knots
 from ponn_torch.solving.solution import Solution
 from ponn_torch.solving.switching import wrong_side
@@ -192,7 +192,6 @@ def signs(solution: Solution, tolerance: float, n_points: int = 401) -> tuple[fl
     even = torch.linspace(-1.0, 1.0, n_points, **options)
     near = torch.logspace(-9, -2.3, 40, **options)
     fractions = torch.linspace(0.0, 1.0, 41, **options)
-    affine = solution.bvp.law.n_switching == arcs.shape[-1]
     grid = torch.cat([even, near - 1.0, 1.0 - near]).sort().values
     deepest, share = 0.0, 0.0
     for segments, (start, end) in zip(solution.arc_segments, pairwise(arc_knots(solution)), strict=True):
@@ -214,7 +213,7 @@ def signs(solution: Solution, tolerance: float, n_points: int = 401) -> tuple[fl
                 break
             left, right = z[peaks - 1], z[peaks + 1]
             z = (left[:, None] + (right - left)[:, None] * fractions).flatten().unique()
-        if affine:  # an arc with S = 0, or inside the bounds, is singular
+        if solution.bvp.law.jumps:  # an arc with S = 0, or inside the bounds, is singular
             zero = (switching(even[1:-1]).abs() <= tolerance).double().mean(0)
             share = max(share, float(torch.where(codes == INTERIOR, 1.0, zero).max()))
     return deepest, share

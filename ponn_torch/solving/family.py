@@ -16,7 +16,7 @@ from ponn_torch.optim.base import Status, Stopping
 from ponn_torch.optim.least_squares import LevenbergMarquardt
 from ponn_torch.optimal_control.boundary_value_problem import Setting
 from ponn_torch.optimal_control.collocation import Collocation, Unknowns
-from ponn_torch.optimal_control.control_laws import Minimiser, Regime
+from ponn_torch.optimal_control.control_set import Minimiser, Regime
 from ponn_torch.optimal_control.curve import Curve
 from ponn_torch.optimal_control.discretisation import Discretisation
 from ponn_torch.solving.guess import project

@@ -16,7 +16,7 @@ from ponn_torch.numerics.autodiff import gradients
 from ponn_torch.numerics.piecewise import PiecewiseChebyshev, approximate
 from ponn_torch.numerics.tape import taped
 from ponn_torch.optimal_control.boundary_value_problem import Setting
-from ponn_torch.optimal_control.control_laws import Regime
+from ponn_torch.optimal_control.control_set import Regime
 from ponn_torch.optimal_control.problem import Named
 from ponn_torch.solving.growth import restarts
 from ponn_torch.solving.solution import Solution

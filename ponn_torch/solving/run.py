@@ -200,7 +200,7 @@ class Run:
 
     @property
     def smoothable(self) -> bool:
-        return self.bvp.law.n_switching > 0 and not self.bvp.law.curved
+        return self.bvp.law.jumps
 
     @property
     def reads_arcs(self) -> bool:

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from ponn_torch.numerics.quadrature import integrate
 from ponn_torch.optimal_control.boundary_value_problem import BoundaryValueProblem, Setting
-from ponn_torch.optimal_control.control_laws import INTERIOR, LOWER, UPPER
+from ponn_torch.optimal_control.control_set import INTERIOR, LOWER, UPPER
 from ponn_torch.optimal_control.curve import Curve
 from ponn_torch.optimal_control.discretisation import Weak
 from ponn_torch.optimal_control.pontryagin import pontryagin
@@ -68,7 +68,7 @@ class Solution:
         if self.curve.xi.dim() != 1:
             raise ValueError(f"xi has shape {tuple(self.curve.xi.shape)}; a Solution holds one curve, shape (N,)")
         regime = self.curve.collocation.setting.regime
-        if self._jumps and regime.arcs is None and not self.curve.smoothing:
+        if self.bvp.law.jumps and regime.arcs is None and not self.curve.smoothing:
             raise ValueError(
                 f"{self.problem.name}: its optimal control jumps, so the setting needs a smoothing or arcs"
             )
@@ -92,17 +92,11 @@ class Solution:
         return self.bvp.problem
 
     @property
-    def _jumps(self) -> bool:
-        """H is affine in the control, so that it needs a smoothing or arcs."""
-        law = self.bvp.law
-        return law.n_switching > 0 and not getattr(law, "curved", False)
-
-    @property
     def kind(self) -> str:
         """``split`` into arcs, ``smoothed`` by a regulariser, or ``smooth`` by itself."""
         if self.curve.collocation.setting.regime.arcs is not None:
             return "split"
-        return "smoothed" if self._jumps else "smooth"
+        return "smoothed" if self.bvp.law.jumps else "smooth"
 
     @property
     def smoothing(self) -> float | None:

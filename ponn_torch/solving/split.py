@@ -19,7 +19,7 @@ from torch import Tensor
 from ponn_torch.optim.base import Status
 from ponn_torch.optimal_control.boundary_value_problem import Setting
 from ponn_torch.optimal_control.collocation import Collocation
-from ponn_torch.optimal_control.control_laws import Regime
+from ponn_torch.optimal_control.control_set import Regime
 from ponn_torch.optimal_control.curve import Curve
 from ponn_torch.optimal_control.discretisation import Discretisation
 from ponn_torch.optimal_control.problem import DisplayUnit

@@ -17,7 +17,7 @@ from ponn_torch.ansatz.basis import FreeFunction
 from ponn_torch.numerics.nodes import NodeSet
 from ponn_torch.optimal_control.boundary_value_problem import Chain, Setting
 from ponn_torch.optimal_control.collocation import Collocation
-from ponn_torch.optimal_control.control_laws import Regime
+from ponn_torch.optimal_control.control_set import Regime
 from ponn_torch.optimal_control.curve import Curve
 from ponn_torch.optimal_control.discretisation import Discretisation, Form, Strong, Weak
 from ponn_torch.optimal_control.expressions import LinearExpressions

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from ponn_torch.optimal_control.boundary_value_problem import Setting
-from ponn_torch.optimal_control.control_laws import INTERIOR, LOWER, UPPER, Regime
+from ponn_torch.optimal_control.control_set import INTERIOR, LOWER, UPPER, Regime
 from ponn_torch.optimal_control.curve import Curve
 
 

@@ -21,7 +21,7 @@ from ponn_torch.optim.least_squares import LevenbergMarquardt
 from ponn_torch.optim.restricted import Restricted
 from ponn_torch.optimal_control.boundary_value_problem import Setting
 from ponn_torch.optimal_control.collocation import Collocation
-from ponn_torch.optimal_control.control_laws import Regime
+from ponn_torch.optimal_control.control_set import Regime
 from ponn_torch.optimal_control.curve import Curve
 from ponn_torch.solving.guess import project
 from ponn_torch.solving.refinement import MakeCallback, Outcome, Refined, Refinement, Segmentation

@@ -12,7 +12,7 @@ import torch
 from ponn_torch.baselines.controls import control_variables
 from ponn_torch.baselines.direct import TwoStage, Unstructured
 from ponn_torch.baselines.transcription import Phase, Program, RadauRule
-from ponn_torch.optimal_control.control_laws import LOWER, UPPER
+from ponn_torch.optimal_control.control_set import LOWER, UPPER
 from ponn_torch.optimal_control.problem import OptimalControlProblem
 from ponn_torch.problems.constants import DAY
 from ponn_torch.problems.double_integrator import minimum_energy, minimum_fuel, minimum_time

@@ -14,17 +14,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
 
-from ponn_torch.optimal_control.control_laws import (
-    INTERIOR,
-    LOWER,
-    UPPER,
-    Box,
-    ControlSet,
-    Minimiser,
-    Regime,
-    ThrustBall,
-    Unconstrained,
-)
+from ponn_torch.optimal_control.control_laws import Box, ThrustBall, Unconstrained
+from ponn_torch.optimal_control.control_set import INTERIOR, LOWER, UPPER, ControlSet, Minimiser, Regime
 from ponn_torch.optimal_control.regularisers import REGULARISERS, Entropy, make_regulariser
 
 NONE = SimpleNamespace()

@@ -19,7 +19,8 @@ from ponn_torch.ansatz.basis import LinearBasis, RandomFeatures
 from ponn_torch.numerics.tape import RECORDING_PAYS
 from ponn_torch.optimal_control.boundary_value_problem import Setting
 from ponn_torch.optimal_control.collocation import Collocation
-from ponn_torch.optimal_control.control_laws import Regime, ThrustBall
+from ponn_torch.optimal_control.control_laws import ThrustBall
+from ponn_torch.optimal_control.control_set import Regime
 from ponn_torch.optimal_control.discretisation import discretise
 from ponn_torch.optimal_control.meaning import LARGE, MOST, Keyed, meaning
 from ponn_torch.optimal_control.pontryagin import pontryagin, probe_points

@@ -14,7 +14,7 @@ from ponn_torch.optim.least_squares import LevenbergMarquardt
 from ponn_torch.optim.quasi_newton import LBFGS
 from ponn_torch.optimal_control.boundary_value_problem import Setting
 from ponn_torch.optimal_control.collocation import component_names
-from ponn_torch.optimal_control.control_laws import Regime
+from ponn_torch.optimal_control.control_set import Regime
 from ponn_torch.optimal_control.curve import Curve
 from ponn_torch.optimal_control.measurements import Measured, MeasurementFile, Measurements
 from ponn_torch.solving.guess import RandomGuess, project

@@ -13,7 +13,8 @@ from torch import Tensor
 from torch.func import grad, jvp
 
 from ponn_torch.optimal_control.boundary_value_problem import BoundaryValueProblem, Chain, Setting
-from ponn_torch.optimal_control.control_laws import Box, Regime
+from ponn_torch.optimal_control.control_laws import Box
+from ponn_torch.optimal_control.control_set import Regime
 from ponn_torch.optimal_control.pontryagin import pontryagin
 from ponn_torch.optimal_control.problem import OptimalControlProblem
 

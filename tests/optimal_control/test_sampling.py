@@ -7,7 +7,8 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from ponn_torch.optimal_control.control_laws import Box, Minimiser, ThrustBall, Unconstrained
+from ponn_torch.optimal_control.control_laws import Box, ThrustBall, Unconstrained
+from ponn_torch.optimal_control.control_set import Minimiser
 from ponn_torch.optimal_control.stationary import Stationary
 
 NONE = torch.zeros(5, 0, dtype=torch.float64)

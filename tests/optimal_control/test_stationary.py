@@ -14,7 +14,7 @@ from torch import Tensor
 from torch.func import jacrev, vjp, vmap
 
 from ponn_torch.numerics.autodiff import gradients
-from ponn_torch.optimal_control.control_laws import Regime
+from ponn_torch.optimal_control.control_set import Regime
 from ponn_torch.optimal_control.stationary import Stationary
 
 NONE = SimpleNamespace()

@@ -18,7 +18,7 @@ from helpers import random
 from ponn_torch.ansatz.basis import Chebyshev, GaussianRBF, Legendre, RandomFeatures
 from ponn_torch.ansatz.networks import MLP, FrozenMLP
 from ponn_torch.ansatz.switch_neurons import SwitchNeuronBasis
-from ponn_torch.optimal_control.control_laws import Regime
+from ponn_torch.optimal_control.control_set import Regime
 from ponn_torch.optimal_control.curve import Curve
 from ponn_torch.optimal_control.problem import ProblemOrigin
 from ponn_torch.optimal_control.references import load_problem

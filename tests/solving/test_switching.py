@@ -14,7 +14,8 @@ from torch import Tensor
 from ponn_torch.ansatz.basis import Chebyshev
 from ponn_torch.numerics.nodes import make_nodes
 from ponn_torch.optimal_control.collocation import Collocation
-from ponn_torch.optimal_control.control_laws import INTERIOR, LOWER, UPPER, Box, Regime
+from ponn_torch.optimal_control.control_laws import Box
+from ponn_torch.optimal_control.control_set import INTERIOR, LOWER, UPPER, Regime
 from ponn_torch.optimal_control.curve import Curve
 from ponn_torch.optimal_control.discretisation import Discretisation
 from ponn_torch.optimal_control.pontryagin import pontryagin

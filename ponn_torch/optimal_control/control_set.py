@@ -1,0 +1,121 @@
+"""What a control set answers to whom: the minimiser of H over it, switching functions, codes of arcs.
+
+A control set sees the Hamiltonian only as a function of its control, ``h(**control) -> (..., 1)``, at a fixed time,
+state and costate. *Switching functions* are the scalars whose zeros separate the arcs of a bounded control.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, NamedTuple, Protocol
+
+import torch
+from torch import Tensor
+
+Hamiltonian = Callable[..., Tensor]
+
+LOWER, INTERIOR, UPPER = 0, 1, 2  # codes of an arc
+
+
+class Minimiser(NamedTuple):
+    """What a control set answers: the control by name, S (..., m) and the fraction η (..., m) of its range."""
+
+    control: dict[str, Tensor]
+    switching: Tensor
+    fraction: Tensor
+
+
+@dataclass(frozen=True)
+class Regime:
+    """How a bounded control is chosen: smoothed by ρ (..., 1), or pinned to arc codes (..., m)."""
+
+    smoothing: Tensor | None = None
+    arcs: Tensor | None = None
+
+
+def finite(value: Any) -> bool:
+    """Whether a value is one finite number; text and arrays are none."""
+    try:
+        return math.isfinite(value)
+    except (TypeError, ValueError, RuntimeError):  # what is no number; what is several; torch's word for the same
+        return False
+
+
+class ControlSet(Protocol):
+    """The admissible controls and the minimiser of the Hamiltonian over them."""
+
+    @property
+    def names(self) -> dict[str, int]:
+        """Names and sizes of the controls that the dynamics read."""
+        ...
+
+    @property
+    def n_switching(self) -> int:
+        """Number of switching functions; 0 where the control has no bound."""
+        ...
+
+    @property
+    def curved(self) -> bool:
+        """Whether H is convex in the bounded control: every component then has two switching functions."""
+        ...
+
+    @property
+    def jumps(self) -> bool:
+        """Whether H is affine in a bounded control, which then jumps between its bounds unless it is smoothed."""
+        return self.n_switching > 0 and not self.curved
+
+    @property
+    def n_bounded(self) -> int:
+        """Components that have bounds, each with an arc code."""
+        return self.n_switching // 2 if self.curved else self.n_switching
+
+    def probe(self, one: Tensor) -> dict[str, Tensor]:
+        """An admissible control with the batch shape of ``one`` (..., 1)."""
+        ...
+
+    def adapted(self, h: Hamiltonian, cost: Hamiltonian, p: Any, one: Tensor, unit: float) -> ControlSet:
+        """A copy that knows, from probes of H and of the running cost, whether H is curved and what s is.
+
+        ``h`` and ``cost`` take controls with the batch shape of ``one`` (2k, 1): k points, and these again with the
+        opposite costates. ``unit`` is the scale of H, in cost per time, where the running cost does not tell s.
+
+        Raises:
+            ValueError: H is not of a kind that the set minimises.
+        """
+        ...
+
+    def minimise(self, h: Hamiltonian, p: Any, like: Tensor, regime: Regime) -> Minimiser:
+        """Minimise h; ``like`` is any (..., 1) tensor of the right shape, ``p`` the problem's parameters."""
+        ...
+
+    def penalty(self, minimiser: Minimiser, p: Any, smoothing: Tensor) -> Tensor:
+        """What the regulariser adds to the running cost, (..., 1)."""
+        ...
+
+    def arc_codes(self, switching: Tensor) -> Tensor:
+        """Arc codes (..., m) that the minimum principle asks for, from the switching functions."""
+        ...
+
+    def samples(self, minimiser: Minimiser, p: Any) -> Minimiser:
+        """Other admissible controls, and their η, on a new first axis: far from the given one and near it."""
+        ...
+
+
+class Unbounded(ControlSet, Protocol):
+    """What sets without bounds share: there are no arcs."""
+
+    @property
+    def n_switching(self) -> int:
+        return 0
+
+    @property
+    def curved(self) -> bool:
+        return False
+
+    def penalty(self, minimiser: Minimiser, p: Any, smoothing: Tensor) -> Tensor:
+        return torch.zeros_like(smoothing)
+
+    def arc_codes(self, switching: Tensor) -> Tensor:
+        return torch.zeros_like(switching, dtype=torch.long)
