@@ -9,8 +9,9 @@ import torch
 from torch import Tensor
 
 from ponn_torch.optimal_control.boundary_value_problem import Setting
-from ponn_torch.optimal_control.collocation import Collocation, Unknowns
+from ponn_torch.optimal_control.collocation import Collocation
 from ponn_torch.optimal_control.control_set import Regime
+from ponn_torch.optimal_control.layout import Unknowns
 
 
 @dataclass(frozen=True, eq=False)

@@ -15,10 +15,11 @@ from torch import Tensor
 from ponn_torch.optim.base import Status, Stopping
 from ponn_torch.optim.least_squares import LevenbergMarquardt
 from ponn_torch.optimal_control.boundary_value_problem import Setting
-from ponn_torch.optimal_control.collocation import Collocation, Unknowns
+from ponn_torch.optimal_control.collocation import Collocation
 from ponn_torch.optimal_control.control_set import Minimiser, Regime
 from ponn_torch.optimal_control.curve import Curve
 from ponn_torch.optimal_control.discretisation import Discretisation
+from ponn_torch.optimal_control.layout import Unknowns
 from ponn_torch.solving.guess import project
 from ponn_torch.solving.refinement import Segmentation, shared_out
 from ponn_torch.solving.switching import wrong_side

@@ -12,10 +12,11 @@ from torch import Tensor
 from ponn_torch.ansatz.basis import Chebyshev
 from ponn_torch.numerics.nodes import make_nodes
 from ponn_torch.optimal_control.boundary_value_problem import BoundaryValueProblem
-from ponn_torch.optimal_control.collocation import Collocation, Unknowns
+from ponn_torch.optimal_control.collocation import Collocation
 from ponn_torch.optimal_control.curve import Curve
 from ponn_torch.optimal_control.discretisation import Strong, discretise
 from ponn_torch.optimal_control.expressions import LinearExpressions
+from ponn_torch.optimal_control.layout import Unknowns
 
 ScaledCurve = Callable[[Tensor], Tensor]  # scaled times (..., m) → w (..., m, 2n)
 

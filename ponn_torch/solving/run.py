@@ -255,11 +255,13 @@ class Run:
         if refinement is None:
             return stages[-1], ""
         refined, note = self._refine(refinement, stages[-1], self.blunter(stages))
+        if not note or not refinement.reads_arcs or self.clock.spent:
+            return refined, note
         solved = [i for i, stage in enumerate(stages) if stage.curve.residual_norm < self.solver.stage_tolerance]
-        if note and refinement.reads_arcs and solved and solved[-1] < len(stages) - 1 and not self.clock.spent:
+        if solved and solved[-1] < len(stages) - 1:
             stages = stages[: solved[-1] + 1]
             again, other = self._refine(refinement, stages[-1], self.blunter(stages))
-            refined, note = (refined, note) if other else (again, "")
+            return (refined, note) if other else (again, "")
         return refined, note
 
     def _refine(self, refinement: Refinement, smoothed: Solution, blunter: Curve | None) -> tuple[Solution, str]:
