@@ -13,12 +13,14 @@ from typing import Any
 import numpy as np
 import torch
 
+from experiments.robustness.asteroids import draw
 from experiments.solves import row
 from experiments.tables import Report, markdown, run_study, share, spread
 from ponn_torch.optimal_control.problem import OptimalControlProblem
 from ponn_torch.problems.constants import DAY
 from ponn_torch.problems.earth_mars import earth_mars, earth_mars_minimum_time
 from ponn_torch.problems.mars_landing import mars_landing
+from ponn_torch.solving.feasibility import check_control, check_final_time
 from ponn_torch.solving.paths import PolarTransfer
 from ponn_torch.solving.result import SolveResult
 from ponn_torch.solving.solver import Solver
@@ -81,6 +83,21 @@ def transfers(count: int, seed: int = 0) -> Report:
     return _report("transfers", rows, {"infeasible": str(infeasible)})
 
 
+def asteroids(count: int, seed: int = 0) -> Report:
+    """Rendezvous with random near-Earth orbits by the default solver; infeasible ones by their twins."""
+    generator, rows = np.random.default_rng(seed), []
+    for i in range(count):
+        data, problem = draw(generator)
+        found = _row(problem, i, Solver().solve(problem, 0), data)
+        if not found["certified"]:
+            twins = Solver(guess=PolarTransfer((0, 1)), n_starts=4)
+            answers = (check(problem, twins) for check in (check_final_time, check_control))
+            found["message"] = next((a.message for a in answers if a is not None and a.infeasible), found["message"])
+        rows.append(found)
+    infeasible = sum("infeasible" in found["message"] for found in rows)
+    return _report("asteroids", rows, {"infeasible": str(infeasible)})
+
+
 def _report(name: str, rows: Sequence[dict[str, Any]], extra: dict[str, str]) -> Report:
     possible = [found for found in rows if "infeasible" not in found["message"]]
     good = [found for found in possible if found["certified"]]
@@ -101,13 +118,15 @@ def _report(name: str, rows: Sequence[dict[str, Any]], extra: dict[str, str]) ->
     return Report({name: rows}, summary, {f"{name}/certified share": len(good) / len(possible)})
 
 
-PARTS = {"landings": (landings, 300), "transfers": (transfers, 100)}
+PARTS = {"landings": (landings, 300), "transfers": (transfers, 100), "asteroids": (asteroids, 30)}
 
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--parts", nargs="+", choices=PARTS, default=list(PARTS))
-    parser.add_argument("--count", type=int, help="cases of every part (default: 300 landings, 100 transfers)")
+    parser.add_argument(
+        "--count", type=int, help="cases of every part (default: 300 landings, 100 transfers, 30 asteroids)"
+    )
     parser.add_argument("--seed", type=int, default=0, help="of the generator of the cases (default: 0, the tables')")
     parser.add_argument("--check-only", action="store_true", help="do not write results")
     arguments = parser.parse_args()
