@@ -39,7 +39,7 @@ def test_infeasible_with_the_thrust_given_and_nothing_else_is_asked() -> None:
     )
     (sentence,) = explanation(earth_mars(**EARTH_VENUS), solver, 0, None)
     assert sentence == (
-        "infeasible unless less will do: "
+        "infeasible unless another extremal needs less: "
         "the least-control extremal found (certified) needs thrust up to 0.4734805 N, more than 0.33 N"
     )
 

@@ -87,7 +87,7 @@ class ControlNeeded:
         least, given = (f"{u / self.unit.size:.8g} {self.unit.label}".rstrip() for u in (self.needed, self.allowed))
         if self.infeasible:
             found = f"the least-control extremal found (certified) needs {self.name} up to {least}, more than {given}"
-            return f"infeasible unless less will do: {found}"
+            return f"infeasible unless another extremal needs less: {found}"
         return f"not for want of {self.name}: an extremal (certified) needs no more than {least} of {given}"
 
 

@@ -74,12 +74,12 @@ class Solver:
     n_nodes: int = 60
     form: Form = field(default_factory=Strong)
     conditioning: str = "columns"
-    n_segments: int | Sequence[int] = (1, 1, 4, 4)
+    n_segments: int | Sequence[int] = (1, 1, 4, 1, 1, 4, 4, 4, 4)
     optimizer: Optimizer = field(default_factory=_default_optimizer)
     continuation: Schedule = field(default_factory=lambda: Ladder((1.0, 0.3, 0.1, 0.03)))
     refinement: Refinement | None = field(default_factory=Split)
     guess: Guess = field(default_factory=_default_guess)
-    n_starts: int = 10
+    n_starts: int = 12
     n_certified: int = 1
     start_limit: float = 0.1
     warm_damping: float = 1e-5

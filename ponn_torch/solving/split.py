@@ -40,6 +40,7 @@ COLLAPSED = 1e-7  # fraction of the final time, below which an arc is solved awa
 LEGIBLE = 1e-4  # ‖r‖ of a sharpened curve whose arcs are worth reading
 MOVED = 1e-3  # fraction of the final time: arcs are split anew where a sharper curve moves a switch by more
 SAME_SWITCH = 1e-6  # scaled times that differ by less are those of one switch
+MOST_UNSOLVED = 3  # sharpened curves in a row that are no solutions, after which there is none this way
 SMALLEST_STEP = 0.9  # factor on the smoothing, above which a curve is not sharpened any more
 MORE_SEGMENTS = 4  # multiples of n_segments that are tried where there is no smoothing to lower
 
@@ -125,7 +126,7 @@ class Split(Segmentation, Refinement):
         """
         least = max(self.n_segments, min(start.collocation.n_segments, self.max_segments // 2))
         yield start, least
-        smoothing, factor = start.smoothing, self.sharpening
+        smoothing, factor, unsolved = start.smoothing, self.sharpening, 0
         for attempt in range(self.max_sharpenings):
             if not smoothing:
                 if attempt < MORE_SEGMENTS:
@@ -137,13 +138,14 @@ class Split(Segmentation, Refinement):
                 return
             collocation = Collocation.on_segments(search.discretisation, times, setting=start.collocation.setting)
             curve, result = self.solve(collocation.with_setting(smoothing=sharper), start, search.rounds)
+            unsolved = 0 if self.solved(result) else unsolved + 1
             if result.status.cut or float(result.norm) < LEGIBLE:
                 start, smoothing = curve, sharper
                 yield start, least
-            elif factor > SMALLEST_STEP:
-                return
             else:
                 factor = factor**0.5
+            if unsolved == MOST_UNSOLVED or factor > SMALLEST_STEP:
+                return
 
     def _split(self, search: _Search, curve: Curve, structure: Structure, n_segments: int) -> Refined:
         """Rounds from one curve, depth first through the repairs of its arcs; the last curve that is solved is kept."""

@@ -52,7 +52,7 @@ def test_the_least_control_decides(final_time: float, infeasible: bool) -> None:
     least = f"{4 / final_time**2:.8g}"
     if infeasible:
         needs = f"the least-control extremal found (certified) needs force up to {least}, more than 1"
-        assert found.message == f"infeasible unless less will do: {needs}"
+        assert found.message == f"infeasible unless another extremal needs less: {needs}"
     else:
         assert found.message == f"not for want of force: an extremal (certified) needs no more than {least} of 1"
 
