@@ -31,6 +31,7 @@ from ponn_torch.solving.refinement import Refinement
 from ponn_torch.solving.result import SolveResult
 from ponn_torch.solving.run import Run
 from ponn_torch.solving.split import Split
+from ponn_torch.solving.stages import Stages
 
 
 def _default_optimizer() -> Optimizer:
@@ -135,7 +136,7 @@ class Solver:
         Raises:
             ForeignJournal: a journal of another solve, before anything is computed.
         """
-        return Run(self, problem, seed, observer or SilentObserver(), journal).result()
+        return Run(Stages(self, problem, seed, observer or SilentObserver(), journal)).result()
 
     def determined_by(self, problem: OptimalControlProblem, seed: int) -> dict[str, str]:
         """A digest of everything that a solve's result depends on, by name: all but the budget."""

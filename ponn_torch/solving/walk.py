@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING
 
 from torch import Tensor
 
@@ -14,9 +13,7 @@ from ponn_torch.optimal_control.discretisation import Form
 from ponn_torch.solving.continuation import Outcome
 from ponn_torch.solving.sharpening import legible
 from ponn_torch.solving.solution import Solution
-
-if TYPE_CHECKING:
-    from ponn_torch.solving.run import Run
+from ponn_torch.solving.stages import Stages
 
 
 @dataclass
@@ -26,7 +23,7 @@ class Walk:
     n_failed: first stages that failed; until one has not, the walk has not begun. form: of the last stage tried.
     """
 
-    run: Run
+    stages: Stages
     collocation: Collocation
     xi: Tensor
     kept: list[Solution] = field(default_factory=list)
@@ -37,25 +34,25 @@ class Walk:
 
     def __call__(self, value: float, parameter: str, form: Form | None, *, hold: bool = False) -> Outcome:
         """Solve one stage from where the walk stands; ``hold``: stay there if it cannot be trusted."""
-        run, smoothed = self.run, self.run.smoothable or parameter != "smoothing"
-        if self.begun and (run.clock.spent or not smoothed):  # nothing to smooth: one stage is all there is
+        stages, smoothed = self.stages, self.stages.smoothable or parameter != "smoothing"
+        if self.begun and (stages.clock.spent or not smoothed):  # nothing to smooth: one stage is all there is
             return Outcome.ABORT
         self.form = form
-        trial = replace(self.collocation, discretisation=run.discretisation(form))
+        trial = replace(self.collocation, discretisation=stages.discretisation(form))
         if smoothed:
             trial = trial.with_setting(**{parameter: value})
-        optimizer = run.stage_optimizer
+        optimizer = stages.optimizer
         if self.begun:
-            optimizer = warm(optimizer, run.solver.warm_damping)
+            optimizer = warm(optimizer, stages.solver.warm_damping)
         try:
-            result = run.optimise("smooth", trial, self.xi, optimizer)
+            result = stages.optimise("smooth", trial, self.xi, optimizer)
         except NonFiniteResidual as error:
             self.message = str(error)
             return Outcome.FAILED if self.begun else Outcome.ABORT
-        solution = run.record("smooth", Curve(trial, result.xi), result)
+        solution = stages.record("smooth", Curve(trial, result.xi), result)
         # measurements need not fit: what counts are the equations
-        norm = float(result.norm if run.measurements is None else trial.residual(result.xi).norm())
-        if norm < run.solver.start_limit:
+        norm = float(result.norm if stages.measurements is None else trial.residual(result.xi).norm())
+        if norm < stages.solver.start_limit:
             return self._advanced(trial, result.xi, solution, hold)
         return Outcome.FAILED if self.begun else self._not_begun(solution, result, norm, parameter)
 
@@ -78,8 +75,8 @@ class Walk:
 
     def _advanced(self, trial: Collocation, xi: Tensor, solution: Solution, hold: bool) -> Outcome:
         """A stage that is solved: the walk goes there, and keeps it if it can be trusted."""
-        run, self.begun = self.run, True
-        trusted = run.trusted(solution)
+        stages, self.begun = self.stages, True
+        trusted = stages.trusted(solution)
         if hold and not trusted:
             return Outcome.UNTRUSTED
         change = float((xi - self.xi).abs().max())
@@ -90,22 +87,22 @@ class Walk:
             self.message = "no stage solves its own problem between the nodes; the first one is kept"
         if change < 1e-6 * float(xi.abs().max()):
             return Outcome.UNCHANGED
-        if trusted and run.reads_arcs and (blunter := run.blunter(self.kept)):
+        if trusted and stages.reads_arcs and (blunter := stages.blunter(self.kept)):
             return Outcome.LEGIBLE if legible(solution.curve, blunter) else Outcome.SOLVED
         return Outcome.SOLVED if trusted else Outcome.UNTRUSTED
 
     def _not_begun(self, solution: Solution, result: OptimizeResult, norm: float, parameter: str) -> Outcome:
         """A first stage that failed; at the next smoothing it is tried once more."""
-        run = self.run
-        if run.coarse(result):
+        stages = self.stages
+        if stages.coarse(result):
             self.collocation, self.xi = solution.curve.collocation, result.xi
             self.kept.append(solution)  # what a refinement on segments starts from, if not a solution
             return Outcome.ABORT
         self.message = (
-            f"start {run.start + 1} of seed {run.seed} failed: ‖r‖ = {norm:.2g} "
+            f"start {stages.start + 1} of seed {stages.seed} failed: ‖r‖ = {norm:.2g} "
             f"after the {('first', 'second')[self.n_failed]} stage ({result.status.value})"
         )
         self.n_failed += 1
         # smoothed less, the problem may have a solution, or one that is nearer to this guess
-        again = self.n_failed == 1 and run.smoothable and parameter == "smoothing" and not run.clock.spent
+        again = self.n_failed == 1 and stages.smoothable and parameter == "smoothing" and not stages.clock.spent
         return Outcome.FAILED if again else Outcome.ABORT
