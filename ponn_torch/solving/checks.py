@@ -141,10 +141,10 @@ def depends_on_time(solution: Solution) -> bool:
     return bool((_time_slope(solution, t.double().cpu()[:, None], w.double().cpu(), setting) != 0).any())
 
 
-def _flown(solution: Solution, flight: Flight) -> tuple[Tensor, Tensor, Setting]:
-    """(t (m, 1), w (m, 2n), setting) at the steps of a flown extremal."""
-    w = torch.from_numpy(flight.y[:, : solution.bvp.dimension].copy())
-    return torch.from_numpy(flight.t)[:, None], w, _settings(solution, _segments(solution, flight))
+def _flown(solution: Solution, flight: Flight, steps: Tensor | slice = slice(None)) -> tuple[Tensor, Tensor, Setting]:
+    """(t (m, 1), w (m, 2n), setting) at steps of a flown extremal, by default at all of them."""
+    t, w = torch.from_numpy(flight.t), torch.from_numpy(flight.y[:, : solution.bvp.dimension].copy())
+    return t[steps, None], w[steps], _settings(solution, _segments(solution, flight)[steps])
 
 
 def hamiltonian(solution: Solution, flight: Flight) -> tuple[Tensor, float]:
@@ -171,11 +171,8 @@ def minimality(solution: Solution, flight: Flight, terms: float, n_points: int =
 
     u* is the control flown. H is the one that its regime minimises, taken from the problem's functions alone.
     """
-    t, w, setting = _flown(solution, flight)
-    chosen = torch.linspace(0, len(t) - 1, n_points).round().long().unique()
-    regime = Regime(*(None if v is None else v[chosen] for v in (setting.regime.smoothing, setting.regime.arcs)))
-    setting = Setting(regime, {name: value[chosen] for name, value in setting.parameters.items()})
-    excess = float(solution.reference.excess(t[chosen], w[chosen], setting).max())
+    steps = torch.linspace(0, len(flight.t) - 1, n_points).round().long().unique()
+    excess = float(solution.reference.excess(*_flown(solution, flight, steps)).max())
     return _relative(max(excess, 0.0), terms) if math.isfinite(excess) else math.inf
 
 

@@ -95,14 +95,12 @@ class Run:
 
     def _guessed(self, start: int) -> tuple[Collocation, Tensor]:
         """The collocation of the first stage, and a start's guess projected on it."""
-        like = self.stages.bvp.unit
-        share = torch.linspace(0.0, 1.0, self.solver.n_segments_of(start) + 1, dtype=like.dtype, device=like.device)
-        collocation = Collocation.on_segments(self.stages.discretisation(None), share * self.stages.bvp.final_time)
-        if self.stages.smoothable:
+        bvp, stream = self.stages.bvp, STREAMS * self.stages.seed + start
+        share = torch.linspace(0.0, 1.0, self.solver.n_segments_of(start) + 1, dtype=torch.float64).to(bvp.unit)
+        collocation = Collocation.on_segments(self.stages.discretisation(None), share * bvp.final_time)
+        if bvp.law.jumps:
             collocation = collocation.with_setting(smoothing=1.0)
-        return collocation, project(
-            collocation, self.solver.guess.curve(self.stages.bvp, STREAMS * self.stages.seed + start)
-        )
+        return collocation, project(collocation, self.solver.guess.curve(bvp, stream))
 
     def _one_start(self, collocation: Collocation, xi: Tensor) -> tuple[Solution | None, str]:
         """Everything between a first guess and a trajectory to be judged; None and why where that fails."""
@@ -171,7 +169,7 @@ class Run:
         improved = refined.curve is not smoothed.curve
         for result in refined.rounds:
             if not improved or result is not refined.result:
-                self.stages.note(name, None, result, float("nan"), float("nan"), None)
+                self.stages.note(name, result)
         solution = self.stages.record(name, refined.curve, refined.result) if improved else smoothed
         if refined.outcome is refinements.Outcome.INTERRUPTED and not self.clock.spent:
             raise Interrupted

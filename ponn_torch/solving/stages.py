@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -83,10 +84,6 @@ class Stages:
         return self._discretisations[key]
 
     @property
-    def smoothable(self) -> bool:
-        return self.bvp.law.jumps
-
-    @property
     def reads_arcs(self) -> bool:
         return self.solver.refinement is not None and self.solver.refinement.reads_arcs
 
@@ -98,7 +95,6 @@ class Stages:
 
     def callback(self, collocation: Collocation, residual: Residual | None = None) -> Callback:
         """Tell the observer of an optimiser's iterations, and end the run when its time is spent."""
-
         equations = residual or collocation
 
         def on_iteration(record: Record, xi: Tensor, residual: Tensor) -> None:
@@ -123,37 +119,25 @@ class Stages:
         return result
 
     def record(self, name: str, curve: Curve, result: OptimizeResult) -> Solution:
+        """Keep a stage with the curve it ended at."""
         solution = Solution(curve)
-        self.note(
-            name,
-            curve.smoothing or None,
-            result,
-            solution.off_node_residual,
-            float(curve.collocation.cost(curve.xi)),
-            solution,
-        )
+        self.note(name, result, solution)
         return solution
 
-    def note(
-        self,
-        name: str,
-        smoothing: float | None,
-        result: OptimizeResult,
-        off_node_residual: float,
-        cost: float,
-        solution: Solution | None,
-    ) -> None:
+    def note(self, name: str, result: OptimizeResult, solution: Solution | None = None) -> None:
+        """Keep a stage; without a solution, as one of a refinement's rounds."""
+        curve = None if solution is None else solution.curve
         stage = StageResult(
             name=name,
-            smoothing=smoothing,
+            smoothing=None if curve is None else curve.smoothing or None,
             status=result.status,
             norm=float(result.norm),
             n_iterations=result.n_iterations,
             n_residuals=result.n_residuals,
             n_linearisations=result.n_linearisations,
             cpu_seconds=result.cpu_seconds,
-            off_node_residual=off_node_residual,
-            cost=cost,
+            off_node_residual=math.nan if solution is None else solution.off_node_residual,
+            cost=math.nan if curve is None else float(curve.collocation.cost(curve.xi)),
             records=result.records,
             start=self.start,
             solution=solution,

@@ -34,7 +34,7 @@ class Walk:
 
     def __call__(self, value: float, parameter: str, form: Form | None, *, hold: bool = False) -> Outcome:
         """Solve one stage from where the walk stands; ``hold``: stay there if it cannot be trusted."""
-        stages, smoothed = self.stages, self.stages.smoothable or parameter != "smoothing"
+        stages, smoothed = self.stages, self.stages.bvp.law.jumps or parameter != "smoothing"
         if self.begun and (stages.clock.spent or not smoothed):  # nothing to smooth: one stage is all there is
             return Outcome.ABORT
         self.form = form
@@ -104,5 +104,5 @@ class Walk:
         )
         self.n_failed += 1
         # smoothed less, the problem may have a solution, or one that is nearer to this guess
-        again = self.n_failed == 1 and stages.smoothable and parameter == "smoothing" and not stages.clock.spent
+        again = self.n_failed == 1 and stages.bvp.law.jumps and parameter == "smoothing" and not stages.clock.spent
         return Outcome.FAILED if again else Outcome.ABORT
