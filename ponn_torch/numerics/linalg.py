@@ -16,6 +16,8 @@ from torch import Tensor
 
 from ponn_torch.numerics.tape import Replay, recordable
 
+PANEL = 48  # rows of a normal matrix that are formed at once: smaller ones save more and cost more calls
+
 
 def least_squares(matrix: Tensor, ridge: float = 0.0) -> Callable[[Tensor], Tensor]:
     """target (..., R, d) → the shortest X (..., N, d) of least ‖M X − target‖² + ridge ‖X‖², M factored once.
@@ -29,8 +31,24 @@ def least_squares(matrix: Tensor, ridge: float = 0.0) -> Callable[[Tensor], Tens
     return lambda target: right.T @ (inverse[:, None] * (left.T @ target))
 
 
+def _gram(matrix: Tensor) -> Tensor:
+    """The lower triangle of MᵀM for M (..., R, N), a panel of rows at a time; only panels' diagonal blocks go above.
+
+    That is little more than half of the multiplications. Cholesky reads no more of it.
+    """
+    n = matrix.shape[-1]
+    out = matrix.new_zeros(*matrix.shape[:-2], n, n)
+    for start in range(0, n, PANEL):
+        panel = slice(start, start + PANEL)
+        out[..., panel, : panel.stop] = matrix[..., panel].mT @ matrix[..., : panel.stop]
+    return out
+
+
 def _cholesky(matrix: Tensor, scale: Tensor, damping: Tensor) -> tuple[Tensor, Tensor]:
-    """(L, D⁻¹ (..., N, 1)) with D⁻¹ M D⁻¹ + μ = L Lᵀ, D = diag(scale); L is NaN where that is not positive definite."""
+    """(L, D⁻¹ (..., N, 1)) with D⁻¹ M D⁻¹ + μ = L Lᵀ, D = diag(scale); L is NaN where that is not positive definite.
+
+    Of M the lower triangle is read.
+    """
     inverse = (1.0 / scale).unsqueeze(-1)
     scaled = matrix * inverse * inverse.mT
     scaled.diagonal(dim1=-2, dim2=-1).add_(damping)
@@ -80,7 +98,7 @@ class DenseJacobian:
 
     @cached_property
     def _normal(self) -> Tensor:
-        return self.matrix.mT @ self.matrix
+        return _gram(self.matrix)
 
     def scaled_rows(self, factors: Tensor) -> DenseJacobian:
         """diag(factors) J, factors (R,)."""
@@ -160,7 +178,7 @@ class ArrowJacobian:
     @cached_property
     def _normal(self) -> tuple[Tensor, Tensor, Tensor]:
         return (
-            self.local.mT @ self.local,
+            _gram(self.local),
             self.local.mT @ self.shared,
             self.shared.mT @ self.shared,
         )
