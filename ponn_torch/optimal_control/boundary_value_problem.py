@@ -9,7 +9,7 @@ to the constants c, so the costs, S and the control law stay those of the user's
 from __future__ import annotations
 
 from collections.abc import Hashable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
@@ -20,6 +20,7 @@ from ponn_torch.numerics.autodiff import differentiable, gradients_and_values, p
 from ponn_torch.optimal_control.control_set import ControlSet, Minimiser, Regime
 from ponn_torch.optimal_control.meaning import meaning
 from ponn_torch.optimal_control.problem import Named, OptimalControlProblem
+from ponn_torch.optimal_control.singular import singular_control
 
 
 @dataclass(frozen=True)
@@ -53,6 +54,7 @@ class BoundaryValueProblem:
         conjugate (n,): c = costate unit × state unit.
         known_initial, known_final: (2n,) scaled values, NaN where unknown.
         couplings: boolean (2n, 2n), F_i depends on w_j.
+        singular: components of a control that H is affine in whose interior arcs are singular (``with_singular_arcs``).
         statement: what the problem says but for its ends and values of parameters; see ``meaning``.
     """
 
@@ -70,6 +72,7 @@ class BoundaryValueProblem:
     statement: Hashable
     n_multipliers: int = 0
     chains: tuple[Chain, ...] = ()
+    singular: tuple[int, ...] = ()
 
     @cached_property
     def equations(self) -> tuple[Hashable, ...]:
@@ -78,7 +81,7 @@ class BoundaryValueProblem:
         What was found by probes, at the values that the parameters had, has to be the same too.
         """
         tensors = (self.unit, self.exponent, self.conjugate, self.couplings)
-        found = meaning([self.law, self.chains, *tensors], self.problem)
+        found = meaning([self.law, self.chains, self.singular, *tensors], self.problem)
         return self.statement, found, self.unit.device
 
     # -- scaling -----------------------------------------------------------------------------------------------
@@ -161,8 +164,11 @@ class BoundaryValueProblem:
         def h(**u: Tensor) -> Tensor:
             return self._hamiltonian(time, x, costates, Named(**u), p)[0]
 
+        regime = setting.regime
         with differentiable(t, w, *setting.parameters.values()):
-            return self.law.minimise(h, p, w[..., :1], setting.regime)
+            if self.singular and regime.arcs is not None and regime.interior is None:
+                regime = replace(regime, interior=singular_control(self, t, w, setting).fraction)
+            return self.law.minimise(h, p, w[..., :1], regime)
 
     def rates(self, t: Tensor, w: Tensor, setting: Setting) -> Tensor:
         """F(t, w): scaled rates (..., 2n) of states and costates."""

@@ -5,7 +5,8 @@ constant in cost per time. Three regimes:
 
 - smoothed, H affine in η: ``s ρ e(η)`` is added to the running cost, so the minimum principle stays exact at every ρ;
 - H a convex parabola in η (``curved``): the minimiser is S/curvature clipped to [0, 1] and needs no smoothing;
-- on an arc: the control is at the bound, or in the interior, that the arc's code names.
+- on an arc: the control is at the bound, or in the interior, that the arc's code names. Where H is affine such an
+  arc is singular, S = 0 all along it, and η comes from outside (singular.py).
 """
 
 from __future__ import annotations
@@ -44,7 +45,7 @@ def _fraction(at_lower: Tensor, at_upper: Tensor, curved: bool, law: Bounded, re
             return (at_lower > 0).to(at_lower.dtype)
         return law.regulariser.fraction(at_lower - law.switching_level, regime.smoothing)
     else:
-        free = smooth = 0.5 * torch.ones_like(at_lower)
+        free = smooth = 0.5 * torch.ones_like(at_lower) if regime.interior is None else regime.interior
     if regime.arcs is None:
         return smooth
     zero, one = torch.zeros_like(at_lower), torch.ones_like(at_lower)

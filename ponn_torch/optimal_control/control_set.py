@@ -29,10 +29,15 @@ class Minimiser(NamedTuple):
 
 @dataclass(frozen=True)
 class Regime:
-    """How a bounded control is chosen: smoothed by ρ (..., 1), or pinned to arc codes (..., m)."""
+    """How a bounded control is chosen: smoothed by ρ (..., 1), or pinned to arc codes (..., m).
+
+    ``interior`` is η (..., m) on interior arcs of a control that H is affine in, where H does not say it; one half
+    where it is not given.
+    """
 
     smoothing: Tensor | None = None
     arcs: Tensor | None = None
+    interior: Tensor | None = None
 
 
 def finite(value: Any) -> bool:

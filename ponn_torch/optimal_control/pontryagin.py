@@ -50,6 +50,15 @@ def pontryagin(
         return replace(bvp, **{name: getattr(bvp, name).to(dtype=dtype, device=device) for name in tensors})
 
 
+def with_singular_arcs(bvp: BoundaryValueProblem, components: tuple[int, ...]) -> BoundaryValueProblem:
+    """The same equations, the control of these components being what keeps S at zero on interior arcs."""
+    if components == bvp.singular:
+        return bvp
+    with torch.no_grad():
+        bvp = replace(bvp, singular=components)
+        return replace(bvp, couplings=_couplings(bvp))
+
+
 def _statement(problem: OptimalControlProblem) -> Hashable:
     """All that the equations depend on but the values of parameters; of the ends and the final time, what is known."""
     known = [[value is not None for value in problem.boundary(end)] for end in ("initial", "final")]

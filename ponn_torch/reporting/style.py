@@ -20,7 +20,7 @@ from ponn_torch.solving.solution import Solution
 BLUE, VERMILLION, GREEN, PURPLE = "#0072B2", "#D55E00", "#009E73", "#CC79A7"
 ORANGE, SKY, BLACK, GREY = "#E69F00", "#56B4E9", "#222222", "#8A8A8A"
 COMPONENTS = (BLUE, VERMILLION, GREEN, PURPLE, ORANGE, SKY)
-ARCS = {"max": VERMILLION, "interior": ORANGE, "min": SKY}  # colour of an arc by its label
+ARCS = {"max": VERMILLION, "interior": ORANGE, "singular": ORANGE, "min": SKY}  # colour of an arc by its label
 
 _RC: Any = {
     "font.size": 9.0,

@@ -14,7 +14,7 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, fields
 from typing import Any
 
-from ponn_torch.solving import checks
+from ponn_torch.solving import checks, singular_arcs
 from ponn_torch.solving.flight import control_history, fly_control, fly_extremal
 from ponn_torch.solving.solution import Solution
 
@@ -61,6 +61,8 @@ class Certificate:
         control_end_error_scaled, control_end_errors: the same for the control alone.
         sign_violation: deepest S on the wrong side; None where no arcs are claimed.
         singular_share: largest share of a bang arc over which S is zero to tolerance; None without arcs.
+        singular_violation: how far the control leaves its range on a singular arc, in ranges, infinite where the
+            generalised Legendre–Clebsch condition fails; None without such arcs.
         transversality: worst |λ − φ_x − ψ_xᵀν| at the end, relative to the largest |λ|, both scaled.
         free_time: |H + ∂φ/∂t| at the end, relative to the largest Σ|terms of H|; None for a fixed final time.
         minimality: largest H(u*) − H(u) over samples u of the admissible set, relative to the same; None in
@@ -91,6 +93,7 @@ class Certificate:
     explicit_time: bool
     n_restarts: int = 0
     minimality: float | None = None
+    singular_violation: float | None = None
     tolerances: Tolerances = field(default_factory=Tolerances)
     seconds: float = 0.0
 
@@ -115,6 +118,7 @@ class Certificate:
             ("H above its minimum over the control", self.minimality, t.minimality),
             ("switching function on the wrong side", self.sign_violation, t.sign_violation),
             ("share of an arc with S = 0", self.singular_share, SINGULAR_SHARE),
+            ("control past its bounds on a singular arc", self.singular_violation, t.sign_violation),
             ("residual between the nodes", self.off_node_residual, t.off_node_residual),
             ("transversality", self.transversality, t.transversality),
             ("free final time", self.free_time, t.transversality),
@@ -162,6 +166,7 @@ def certify(solution: Solution, tolerances: Tolerances | None = None) -> Certifi
         "minimality": checks.minimality(solution, extremal, terms),
         "sign_violation": sign,
         "singular_share": singular,
+        "singular_violation": singular_arcs.violation(solution.curve) if solution.bvp.singular else None,
         "off_node_residual": solution.curve.mean_residual(),
         "transversality": transversality,
         "free_time": free_time,
@@ -195,6 +200,7 @@ def _faults(measured: Mapping[str, Any], t: Tolerances) -> list[str]:
         "hamiltonian_drift": t.hamiltonian_drift,
         "minimality": t.minimality,
         "sign_violation": t.sign_violation,
+        "singular_violation": t.sign_violation,
         "off_node_residual": t.off_node_residual,
         "transversality": t.transversality,
         "free_time": t.transversality,

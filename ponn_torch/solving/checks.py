@@ -210,7 +210,7 @@ def signs(solution: Solution, tolerance: float, n_points: int = 401) -> tuple[fl
                 break
             left, right = z[peaks - 1], z[peaks + 1]
             z = (left[:, None] + (right - left)[:, None] * fractions).flatten().unique()
-        if solution.bvp.law.jumps:  # an arc with S = 0, or inside the bounds, is singular
+        if solution.bvp.law.jumps:  # an arc with S = 0 is singular, and has to be claimed as one
             zero = (switching(even[1:-1]).abs() <= tolerance).double().mean(0)
-            share = max(share, float(torch.where(codes == INTERIOR, 1.0, zero).max()))
+            share = max(share, float(torch.where(codes == INTERIOR, 0.0, zero).max()))
     return deepest, share

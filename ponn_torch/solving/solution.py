@@ -19,11 +19,12 @@ from ponn_torch.optimal_control.boundary_value_problem import BoundaryValueProbl
 from ponn_torch.optimal_control.control_set import INTERIOR, LOWER, UPPER
 from ponn_torch.optimal_control.curve import Curve
 from ponn_torch.optimal_control.discretisation import Weak
-from ponn_torch.optimal_control.pontryagin import pontryagin
+from ponn_torch.optimal_control.pontryagin import pontryagin, with_singular_arcs
 from ponn_torch.optimal_control.problem import DisplayUnit, OptimalControlProblem
 from ponn_torch.solving.storage import load_curve, save_curve
 
 ARC_LABELS = {LOWER: "min", INTERIOR: "interior", UPPER: "max"}
+SINGULAR_LABELS = {**ARC_LABELS, INTERIOR: "singular"}  # where H is affine in the control
 TRAJECTORY = "trajectory.csv"
 
 
@@ -85,7 +86,8 @@ class Solution:
         bvp = self.bvp
         if bvp.unit.dtype == torch.float64 and bvp.unit.device.type == "cpu":
             return bvp
-        return pontryagin(bvp.problem, mass_variable=bvp.mass_variable, chains=False)
+        reference = pontryagin(bvp.problem, mass_variable=bvp.mass_variable, chains=False)
+        return with_singular_arcs(reference, bvp.singular)
 
     @property
     def problem(self) -> OptimalControlProblem:
@@ -105,12 +107,13 @@ class Solution:
 
     @property
     def arcs(self) -> list[str]:
-        """One label per arc ("max", "min", "interior"), components joined by ","; [] if not split."""
+        """One label per arc ("max", "min", "interior", "singular"), components joined by ","; [] if not split."""
         codes = self.curve.collocation.setting.regime.arcs
         if codes is None:
             return []
         rows = codes[[segments.start for segments in self.arc_segments]].tolist()
-        return [",".join(ARC_LABELS[code] for code in row) for row in rows]
+        labels = SINGULAR_LABELS if self.bvp.law.jumps else ARC_LABELS
+        return [",".join(labels[code] for code in row) for row in rows]
 
     @property
     def arc_segments(self) -> list[range]:

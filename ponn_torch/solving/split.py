@@ -17,12 +17,15 @@ import torch
 from torch import Tensor
 
 from ponn_torch.optim.base import Status
-from ponn_torch.optimal_control.boundary_value_problem import Setting
+from ponn_torch.optimal_control.boundary_value_problem import BoundaryValueProblem, Setting
 from ponn_torch.optimal_control.collocation import Collocation
 from ponn_torch.optimal_control.control_set import Regime
 from ponn_torch.optimal_control.curve import Curve
 from ponn_torch.optimal_control.discretisation import Discretisation
+from ponn_torch.optimal_control.pontryagin import with_singular_arcs
 from ponn_torch.optimal_control.problem import DisplayUnit
+from ponn_torch.optimal_control.singular import singular_components
+from ponn_torch.solving import singular_arcs
 from ponn_torch.solving.refinement import (
     MakeCallback,
     Outcome,
@@ -34,7 +37,13 @@ from ponn_torch.solving.refinement import (
     shared_out,
 )
 from ponn_torch.solving.sharpening import graded_times, singular_interval, undecided
-from ponn_torch.solving.switching import Structure, claimed_structure, find_structure, needles, without_short_arcs
+from ponn_torch.solving.switching import (
+    Structure,
+    claimed_structure,
+    find_structure,
+    needles,
+    without_short_arcs,
+)
 
 COLLAPSED = 1e-7  # fraction of the final time, below which an arc is solved away to nothing
 LEGIBLE = 1e-4  # ‖r‖ of a sharpened curve whose arcs are worth reading
@@ -50,11 +59,21 @@ class _Search:
     """What the rounds of one refinement share, and what they have left so far.
 
     tried: solved arcs that S was not content with, by the number of segments; what follows from them is not done twice.
+    made: discretisations, by the components with singular arcs.
     """
 
-    discretisation: Discretisation
+    split: Split
+    bvp: BoundaryValueProblem
     rounds: Rounds
     tried: dict[int, list[Structure]] = field(default_factory=lambda: defaultdict(list))
+    made: dict[tuple[int, ...], Discretisation] = field(default_factory=dict)
+
+    def discretisation(self, arcs: Tensor | None = None) -> Discretisation:
+        """Of segments with these arc codes, of which interior ones are singular where H is affine in the control."""
+        components = singular_components(self.bvp.law, arcs)
+        if components not in self.made:
+            self.made[components] = self.split.discretisation(with_singular_arcs(self.bvp, components))
+        return self.made[components]
 
 
 @dataclass(frozen=True)
@@ -82,7 +101,7 @@ class Split(Segmentation, Refinement):
     sharpening: float = 0.5
 
     def run(self, start: Curve, callback: MakeCallback | None = None, blunter: Curve | None = None) -> Refined:
-        search = _Search(self.discretisation(start.collocation.bvp), Rounds(start, callback))
+        search = _Search(self, start.collocation.bvp, Rounds(start, callback))
         try:
             return self._searched(search, start, blunter)
         except KeyboardInterrupt:
@@ -91,18 +110,21 @@ class Split(Segmentation, Refinement):
     def _searched(self, search: _Search, start: Curve, blunter: Curve | None) -> Refined:
         rounds = search.rounds.results
         read: list[tuple[Structure, int]] = []
-        rungs: list[tuple[float, Curve]] = []
-        refined = Refined(start, Outcome.STRUCTURE, rounds)
+        rungs: list[tuple[float, tuple[float, float]]] = []
+        refined, singular = Refined(start, Outcome.STRUCTURE, rounds), None
         for smoothed, n_segments in self._starts(search, start):
             if rounds and rounds[-1].status.cut:
                 return search.rounds.interrupted()
             structures = [find_structure(smoothed, polish=0)]
             if smoothed.smoothing:
-                rungs.append((smoothed.smoothing, smoothed))
+                rungs.append((smoothed.smoothing, undecided(smoothed, smoothed.smoothing)))
+                singular = singular_interval(rungs)
                 if blunter is not None:
                     guessed = find_structure(smoothed, blunter)
                     # of the same arcs the curve's own times fit it better
                     structures = structures if guessed.same_arcs(structures[0]) else [guessed, *structures]
+                if singular is not None:
+                    structures.append(singular_arcs.on_interval(smoothed, singular))
             blunter = smoothed
             moved = MOVED * float(smoothed.times[-1])
             for structure in structures:
@@ -112,7 +134,6 @@ class Split(Segmentation, Refinement):
                 refined = self._split(search, smoothed, structure, n_segments)
                 if refined.outcome in (Outcome.SOLVED, Outcome.INTERRUPTED):
                     return refined
-        singular = singular_interval([(value, undecided(curve, value)) for value, curve in rungs])
         if singular is None:
             return refined
         unit = start.collocation.bvp.problem.display.get("time", DisplayUnit("s"))
@@ -136,7 +157,7 @@ class Split(Segmentation, Refinement):
             times = graded_times(start, sharper, least)
             if len(times) - 1 > self.max_segments:  # as where a component of the control has no effect, and S is noise
                 return
-            collocation = Collocation.on_segments(search.discretisation, times, setting=start.collocation.setting)
+            collocation = Collocation.on_segments(search.discretisation(), times, setting=start.collocation.setting)
             curve, result = self.solve(collocation.with_setting(smoothing=sharper), start, search.rounds)
             unsolved = 0 if self.solved(result) else unsolved + 1
             if result.status.cut or float(result.norm) < LEGIBLE:
@@ -149,8 +170,8 @@ class Split(Segmentation, Refinement):
 
     def _split(self, search: _Search, curve: Curve, structure: Structure, n_segments: int) -> Refined:
         """Rounds from one curve, depth first through the repairs of its arcs; the last curve that is solved is kept."""
-        disc, rounds, tried = search.discretisation, search.rounds.results, search.tried[n_segments]
-        bvp, parameters = disc.bvp, curve.collocation.setting.parameters
+        rounds, tried = search.rounds.results, search.tried[n_segments]
+        bvp, parameters = search.bvp, curve.collocation.setting.parameters
         pending = [(curve, _spread(structure, curve.times, n_segments), math.inf)]
         outcome = Outcome.STRUCTURE
         for _ in range(self.max_rounds):
@@ -162,9 +183,8 @@ class Split(Segmentation, Refinement):
             if len(segments.arcs) > self.max_segments:
                 return Refined(curve, Outcome.TOO_MANY_SEGMENTS, rounds)
             regime = Regime(arcs=segments.arcs if bvp.law.n_switching else None)
-            collocation = Collocation.on_segments(
-                disc, segments.times, events=segments.events, setting=Setting(regime, parameters)
-            )
+            disc, setting = search.discretisation(regime.arcs), Setting(regime, parameters)
+            collocation = Collocation.on_segments(disc, segments.times, events=segments.events, setting=setting)
             solution, result = self.solve(collocation, before, search.rounds)
             if result.status.cut:
                 return search.rounds.interrupted()
@@ -175,7 +195,7 @@ class Split(Segmentation, Refinement):
             repairs, coarse = self._repairs(solution, solved), self.coarse(solution, solved or regime.arcs is not None)
             if not solved:
                 outcome = Outcome.RESIDUAL
-            elif repairs:
+            elif repairs or singular_arcs.violation(solution) > self.sign_tolerance:
                 curve, outcome = solution, Outcome.STRUCTURE
             else:
                 curve, outcome = solution, Outcome.COARSE
@@ -198,13 +218,20 @@ class Split(Segmentation, Refinement):
         return Refined(curve, outcome, rounds)
 
     def _repairs(self, curve: Curve, solved: bool) -> list[Structure]:
-        """Other structures to try, the best first: without the arcs that are gone, or one needle more where S asks."""
+        """Other structures to try, the best first: without the arcs that are gone, or where S asks, with others.
+
+        These are singular arcs where S turns round at a switch, or one needle more.
+        """
         found = claimed_structure(curve)
         ends = torch.cat([curve.times[:1], found.times, curve.times[-1:]])
         merged = without_short_arcs(found, ends, COLLAPSED if solved else self.short_arc)
         if len(merged) < len(found):
             return [merged]
-        return needles(curve, self.needle, self.sign_tolerance) if solved else []
+        if not solved:
+            return []
+        singular = singular_arcs.at_turned_switches(curve, self.sign_tolerance)
+        regular = needles(curve, self.needle, self.sign_tolerance)
+        return regular if singular is None else [singular, *regular]
 
 
 def _spread(structure: Structure, times: Tensor, n_segments: int) -> Segments:

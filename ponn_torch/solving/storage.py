@@ -21,9 +21,10 @@ from ponn_torch.optimal_control.control_set import Regime
 from ponn_torch.optimal_control.curve import Curve
 from ponn_torch.optimal_control.discretisation import Discretisation, Form, Strong, Weak
 from ponn_torch.optimal_control.expressions import LinearExpressions
-from ponn_torch.optimal_control.pontryagin import pontryagin
+from ponn_torch.optimal_control.pontryagin import pontryagin, with_singular_arcs
 from ponn_torch.optimal_control.problem import OptimalControlProblem, nearest
 from ponn_torch.optimal_control.references import load_problem, relative_reference, resolved_reference
+from ponn_torch.optimal_control.singular import singular_components
 
 SOLUTION, WEIGHTS = "solution.json", "weights.npz"
 FORMAT = 1
@@ -104,7 +105,7 @@ def load_curve(folder: Path, problem: OptimalControlProblem | None = None) -> Cu
     if form["class"] not in FORMS:
         raise ValueError(f"{folder / SOLUTION}: form = {form['class']!r}; {nearest(form['class'], FORMS)}")
     discretisation = Discretisation(
-        bvp=replace(bvp, chains=chains),
+        bvp=with_singular_arcs(replace(bvp, chains=chains), singular_components(bvp.law, arrays.get("arcs"))),
         basis=_make_basis(description["basis"], _under("basis", arrays), xi.dtype),
         nodes=NodeSet(
             description["nodes"]["kind"], arrays["node_points"], arrays["node_weights"], arrays.get("node_edges")

@@ -144,12 +144,24 @@ def without_short_arcs(structure: Structure, knot_times: Tensor, fraction: float
 def wrong_side(switching: Tensor, codes: Tensor) -> Tensor:
     """How far every S (m, n_switching) is on the side that its arc's codes (m, k) exclude; negative on the right one.
 
-    A convex H has one S at each bound: the control is off the lower bound where the first is positive, and at the upper
-    where the second is.
+    On a singular arc both sides are wrong. A convex H has one S at each bound: the control is off the lower bound where
+    the first is positive, and at the upper where the second is.
     """
     affine = switching.shape[-1] == codes.shape[-1]
     claimed = codes == UPPER if affine else torch.cat([codes >= INTERIOR, codes >= UPPER], -1)
-    return torch.where(claimed, -switching, switching)
+    depth = torch.where(claimed, -switching, switching)
+    return torch.where(codes == INTERIOR, switching.abs(), depth) if affine else depth
+
+
+def depth_along(curve: Curve, claimed: Structure) -> tuple[Tensor, Tensor, Tensor]:
+    """Scaled times (m,) on a grid, the arc of each, and how far every S (m, n_switching) is on the wrong side there."""
+    collocation = curve.collocation
+    n_points = max(100, 1000 // collocation.n_segments)
+    t, w = grid(curve, n_points)
+    starts = torch.tensor(collocation.switch_knots, dtype=torch.long)
+    of_segment = torch.bucketize(torch.arange(collocation.n_segments), starts, right=True)
+    arc = of_segment.repeat_interleave(n_points).to(t.device)
+    return t, arc, wrong_side(switching_along(curve, t, w), claimed.arcs[arc])
 
 
 def needles(curve: Curve, width: float, tolerance: float) -> list[Structure]:
@@ -159,17 +171,12 @@ def needles(curve: Curve, width: float, tolerance: float) -> list[Structure]:
     first-order effect of a needle variation on the cost, so that a needle leads downhill: two switches about the peak
     of S, or one where S asks to change an end. ``width`` is its longest duration as a fraction of the final time.
     """
-    collocation, claimed = curve.collocation, claimed_structure(curve)
-    if collocation.setting.regime.arcs is None:
+    claimed = claimed_structure(curve)
+    if curve.collocation.setting.regime.arcs is None:
         return []
     arcs, events = claimed.arcs, claimed.events
     ends = torch.cat([curve.times[:1], claimed.times, curve.times[-1:]])
-    n_points = max(100, 1000 // collocation.n_segments)
-    t, w = grid(curve, n_points)
-    starts = torch.tensor(collocation.switch_knots, dtype=torch.long)
-    of_segment = torch.bucketize(torch.arange(collocation.n_segments), starts, right=True)
-    arc = of_segment.repeat_interleave(n_points).to(t.device)
-    depth = wrong_side(switching_along(curve, t, w), arcs[arc])
+    t, arc, depth = depth_along(curve, claimed)
     found: list[tuple[float, Structure]] = []
     for event, column in enumerate(depth.unbind(-1)):
         # runs of points on the wrong side, cut where an arc ends
