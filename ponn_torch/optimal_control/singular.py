@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import torch
 from torch import Tensor
 
-from ponn_torch.numerics.autodiff import gradients
+from ponn_torch.numerics.autodiff import differentiable, gradients
 from ponn_torch.optimal_control.control_set import INTERIOR, ControlSet, Regime
 
 if TYPE_CHECKING:
@@ -42,18 +42,15 @@ def singular_control(bvp: BoundaryValueProblem, t: Tensor, w: Tensor, setting: S
     """η on the singular arcs of the setting, one component of the control at a time; t (..., 1), w (..., 2n)."""
     arcs = setting.regime.arcs
     assert arcs is not None
-    fractions, bends = [], []
-    for component in range(arcs.shape[-1]):
-        half = torch.full_like(w[..., 0], 0.5)
-        if component not in bvp.singular:
-            fractions.append(half)
-            bends.append(0.0 * half)
-            continue
-        at_lower, at_upper = (_second_rate(bvp, t, w, setting, component, share) for share in (0.0, 1.0))
-        bend = at_upper - at_lower
-        inside = (arcs[..., component] == INTERIOR) & (bend != 0)
-        fractions.append(torch.where(inside, -at_lower / torch.where(inside, bend, 1.0), half))
-        bends.append(torch.where(inside, bend, 0.0))
+    half, none = torch.full_like(w[..., 0], 0.5), torch.zeros_like(w[..., 0])
+    fractions, bends = [half] * arcs.shape[-1], [none] * arcs.shape[-1]
+    with differentiable(t, w, *setting.parameters.values()):
+        for i in bvp.singular:
+            at_lower, at_upper = (_second_rate(bvp, t, w, setting, i, share) for share in (0.0, 1.0))
+            bend = at_upper - at_lower
+            inside = (arcs[..., i] == INTERIOR) & (bend != 0)
+            fractions[i] = torch.where(inside, -at_lower / torch.where(inside, bend, 1.0), half)
+            bends[i] = torch.where(inside, bend, none)
     return SingularControl(torch.stack(fractions, -1), torch.stack(bends, -1))
 
 

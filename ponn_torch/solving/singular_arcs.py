@@ -98,8 +98,7 @@ def _violation(curve: Curve, t: Tensor, arcs: Tensor) -> float:
         return 0.0
     parameters = curve.setting(torch.zeros_like(t, dtype=torch.long)).parameters
     setting = Setting(Regime(arcs=arcs), parameters)
-    with torch.no_grad():
-        fraction, bend = singular_control(with_singular_arcs(bvp, components), t[:, None], curve(t), setting)
+    fraction, bend = singular_control(with_singular_arcs(bvp, components), t[:, None], curve(t), setting)
     on = arcs == INTERIOR
     if not bool((bend[on] > 0).all()):
         return math.inf

@@ -176,6 +176,44 @@ def oscillator(x, c) -> Rates:
     return {"z": torch.stack([x.z[..., 1], -x.z[..., 0]], -1) + force, "lambda_z": turned}
 
 
+def goddard(x, c) -> Rates:
+    resistance = 310.0 * torch.exp(-x.h / 0.002)
+    # s is the unit of H, altitude 0.01 in time 0.2, per largest thrust
+    switching = -(c.v / x.m - c.m / 0.5) * 3.5 / (0.01 / 0.2)
+    thrust = 3.5 * 0.5 * (1 + torch.tanh(switching / RHO))
+    drag = resistance * x.v**2
+    return {
+        "h": x.v,
+        "v": (thrust - drag) / x.m - 1 / (1 + x.h) ** 2,
+        "m": -thrust / 0.5,
+        "lambda_h": -c.v * (drag / 0.002 / x.m + 2 / (1 + x.h) ** 3),
+        "lambda_v": -c.h + 2 * c.v * resistance * x.v / x.m,
+        "lambda_m": c.v * (thrust - drag) / x.m**2,
+    }
+
+
+def free_flying_robot(x, c) -> Rates:
+    heading = torch.cat([torch.cos(x.theta), torch.sin(x.theta)], -1)
+    across = torch.cat([-heading[..., 1:], heading[..., :1]], -1)
+    along, turning = dot(c.v, heading), 0.2 * c.omega
+
+    def thruster(slope: Tensor) -> Tensor:
+        """Forward less backward thrust, each paid for at the same price."""
+        return 0.5 * (torch.tanh(-(1 + slope) / RHO) - torch.tanh(-(1 - slope) / RHO))
+
+    left, right = thruster(along + turning), thruster(along - turning)
+    return {
+        "r": x.v,
+        "v": (left + right) * heading,
+        "theta": x.omega,
+        "omega": 0.2 * (left - right),
+        "lambda_r": torch.zeros_like(c.r),
+        "lambda_v": -c.r,
+        "lambda_theta": -(left + right) * dot(c.v, across),
+        "lambda_omega": -c.theta,
+    }
+
+
 CANTED = 1 / (225.0 * G0 * math.cos(math.radians(27.0)))
 BY_HAND: dict[str, Callable[..., Rates]] = {
     "boundary_layer": boundary_layer,
@@ -191,6 +229,8 @@ BY_HAND: dict[str, Callable[..., Rates]] = {
     "energy_landing": energy_landing,
     "energy_transfer": energy_transfer,
     "energy_transfer_limited": energy_transfer_limited,
+    "free_flying_robot": free_flying_robot,
+    "goddard": goddard,
     "mars_landing": landing(CANTED),
     "orbit_raising": orbit_raising,
     "oscillator": oscillator,

@@ -18,8 +18,9 @@ from ponn_torch.optimal_control.control_laws import Box, Unconstrained
 from ponn_torch.optimal_control.control_set import Regime
 from ponn_torch.optimal_control.curve import Curve
 from ponn_torch.optimal_control.discretisation import Discretisation
-from ponn_torch.optimal_control.pontryagin import pontryagin
+from ponn_torch.optimal_control.pontryagin import pontryagin, with_singular_arcs
 from ponn_torch.optimal_control.problem import FreeTime, OptimalControlProblem
+from ponn_torch.optimal_control.singular import singular_components
 from ponn_torch.solving.guess import project
 from ponn_torch.solving.solution import Solution
 
@@ -164,11 +165,13 @@ def solve(
 ) -> Solution:
     """Solve from a straight line between ``guess`` values of w at both ends, on arcs between ``switches``."""
     bvp = pontryagin(problem, mass_variable=mass_variable, dtype=dtype)
+    codes = None if arcs is None else torch.tensor(arcs)[:, None]
+    bvp = with_singular_arcs(bvp, singular_components(bvp.law, codes))
     nodes = make_nodes("legendre_gauss", n_nodes, dtype=dtype)
     disc = Discretisation(bvp, basis or Chebyshev(10), nodes, conditioning=conditioning)
     regime = Regime(
         smoothing=None if smoothing is None else torch.tensor(smoothing, dtype=dtype),
-        arcs=None if arcs is None else torch.tensor(arcs)[:, None],
+        arcs=codes,
     )
     times = torch.tensor([0.0, *switches, bvp.final_time], dtype=dtype)
     events = events if events is not None else [(0,)] * len(switches)

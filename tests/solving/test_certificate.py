@@ -196,15 +196,12 @@ def test_a_saturated_arc_claimed_to_be_interior_is_refused():
     assert certificate.sign_violation > 0.01
 
 
-def test_a_singular_arc_is_never_certified_as_bang_bang():
-    # x = 1 − t, then x = 0 with S = 0: all equations hold, but S does not give the control of the second arc
-    solution = solve(
-        regulator(), [[1.0, -1.0], [0.0, 0.0]], switches=[1.0], arcs=[0, 1], events=[None], tolerance=1e-14
-    )
-    assert solution.arcs == ["min", "interior"]
-    certificate = certify(solution)
-    assert certificate.end_error_scaled < 1e-12
-    assert certificate.off_node_residual < 1e-11
+def test_a_singular_arc_is_certified_as_one_and_never_as_bang_bang():
+    # x = 1 − t, then x = 0 with S = 0
+    solution = solve(regulator(), [[1.0, -1.0], [0.0, 0.0]], switches=[0.9], arcs=[0, 1], tolerance=1e-14)
+    assert solution.arcs == ["min", "singular"]
+    assert certify(solution).certified
+    certificate = certify(with_codes(solution, [0, 2]))
     assert not certificate.certified
     assert certificate.singular_share == 1.0
     assert "may be singular" in certificate.verdict

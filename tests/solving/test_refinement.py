@@ -96,7 +96,7 @@ def test_what_s_was_not_content_with_is_not_taken_up_again_from_a_sharper_curve(
     """Repairs follow from the solved curve alone, wherever it was reached from."""
     start = smoothed("earth_mars", 1.0)
     structure = find_structure(start)  # three arcs of five
-    search = _Search(Split().discretisation(start.collocation.bvp), Rounds(start))
+    search = _Search(Split(), start.collocation.bvp, Rounds(start))
     assert Split(max_rounds=1)._split(search, start, structure, 8).outcome is Outcome.STRUCTURE
     assert Split()._split(search, start, structure, 8).outcome is Outcome.STRUCTURE
     assert len(search.rounds.results) == 2

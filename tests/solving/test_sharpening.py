@@ -1,4 +1,4 @@
-"""Sharper curves show the structure, on segments that resolve them; a singular arc is recognised and said."""
+"""Sharper curves show the structure, on segments that resolve them; a singular arc is recognised."""
 
 from __future__ import annotations
 
@@ -18,8 +18,6 @@ from ponn_torch.optimal_control.pontryagin import pontryagin
 from ponn_torch.optimal_control.problem import OptimalControlProblem
 from ponn_torch.solving.guess import project
 from ponn_torch.solving.sharpening import graded_times, singular_interval, undecided
-from ponn_torch.solving.solver import Solver
-from ponn_torch.solving.split import Split
 from ponn_torch.solving.switching import switching_along
 
 
@@ -95,14 +93,3 @@ def test_an_interval_that_does_not_shrink_is_singular(power, singular):
     assert (found == rungs[-1][1]) if singular else (found is None)
     assert singular_interval(rungs[:2]) is None  # too few to tell
     assert singular_interval([]) is None
-
-
-@pytest.mark.parametrize(("final", "until"), [({}, 3.0), ({"x": 0.5}, 2.5)])
-def test_a_singular_arc_is_said_and_never_certified_as_bang_bang(final, until):
-    solver = Solver(n_starts=1, refinement=Split(max_rounds=2, max_sharpenings=6))
-    result = solver.solve(regulator(**final), 0)
-    assert "singular arc" in result.message
-    named = [float(word) for word in result.message.split() if word[0].isdigit()]
-    assert named == pytest.approx([1.0, until], abs=0.05)
-    assert result.solution is not None
-    assert result.solution.kind == "smoothed"

@@ -82,6 +82,37 @@ ANSWERS = {
     "orbit_raising": Answer(
         -1.525064001468, 1e-11, costates={"r": (-1.87712491,), "vr": (-0.92898546,), "vt": (-2.02464937,)}
     ),
+    "goddard": Answer(
+        -0.0128369183175,
+        1e-12,
+        ("max", "singular", "min"),
+        (0.0235096840415, 0.0726707434415),
+        1e-11,
+        0.198856262105,
+        hamiltonian=0.0,
+    ),
+    "free_flying_robot": Answer(
+        7.910143838106,
+        1e-10,
+        (
+            "min,max,max,min",
+            "min,min,max,min",
+            "min,min,singular,min",
+            "min,min,min,min",
+            "max,min,min,min",
+            "min,min,min,min",
+            "min,max,min,min",
+            "min,min,min,min",
+            "min,min,min,singular",
+            "min,min,min,max",
+            "max,min,min,max",
+        ),
+        (
+            *(0.61027357687, 1.03886867086, 1.12467242450, 2.54088770583, 4.83434645491),
+            *(7.16565354509, 9.45911229417, 10.87532757550, 10.96113132914, 11.38972642313),
+        ),
+        1e-9,
+    ),
     "zermelo": Answer(5.457865263560512, 1e-12, final_time=5.457865263560512, hamiltonian=0.0),
     "earth_mars": Answer(
         396.05984393,
