@@ -7,6 +7,8 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -275,9 +277,12 @@ def test_interrupted_run_keeps_records_and_a_solution(number: signal.Signals, tm
     # a ladder long enough to be interrupted in the middle
     slow = ["continuation=tanh_ladder", "continuation.count=2000", "ansatz.size=40", "nodes.n_nodes=80"]
     command = [sys.executable, "-m", "ponn_torch.cli", *LANDING, *slow, f"hydra.run.dir='{folder}'"]
-    with subprocess.Popen(
-        command, cwd=tmp_path, env=os.environ, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-    ) as process:
+    with (
+        interruptible(),
+        subprocess.Popen(
+            command, cwd=tmp_path, env=os.environ, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        ) as process,
+    ):
         deadline = time.monotonic() + 60
         while time.monotonic() < deadline and process.poll() is None:
             records = folder / "records.jsonl"
@@ -293,6 +298,16 @@ def test_interrupted_run_keeps_records_and_a_solution(number: signal.Signals, tm
     assert events_in(folder).count("stage") >= 2
     assert Solution.load(folder / "solution").smoothing is not None
     assert outcome_in(folder)["exit_code"] == 130
+
+
+@contextmanager
+def interruptible() -> Iterator[None]:
+    """Processes started here take interrupts, which those of a shell's background job inherit as ignored."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 def events_in_progress(records: Path) -> int:
