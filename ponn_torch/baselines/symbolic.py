@@ -50,6 +50,10 @@ def evaluate(function: Callable[..., Tensor], *arguments: Symbols) -> Symbols:
 class _OnSymbols(fx.Interpreter):
     """Runs a graph of ATen operations on arrays of symbols."""
 
+    def __init__(self, graph: fx.GraphModule) -> None:
+        super().__init__(graph)
+        self.extra_traceback = False  # else torch appends the graph's line to the message of an error
+
     def call_function(self, target: Any, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
         name = target.__name__.split(".")[0]
         operation = _operations().get(name)
