@@ -228,6 +228,19 @@ def test_own_problem_from_a_file(own_problem: Path, tmp_path: Path) -> None:
     assert Solution.load(folder / "solution").problem.name == "shift"
 
 
+def test_columns_are_as_wide_as_the_longest_name_needs(
+    own_problem: Path, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    own_problem.write_text(OWN_PROBLEM.replace('"x"', '"longitude"'), encoding="utf-8")
+    assert main([f"problem={own_problem}:shift", "record=minimal", f"hydra.run.dir='{tmp_path / 'run'}'"]) == 0
+    report = (tmp_path / "run" / "report.md").read_text(encoding="utf-8")
+    for text in (capsys.readouterr().out, report):
+        (line,) = (line for line in text.splitlines() if line.startswith("end of longitude"))
+        (below,) = (line for line in text.splitlines() if line.startswith("CPU time"))
+        assert line[16:18] == below[16:18] == "  "
+        assert " " not in line[18] + below[18]
+
+
 @pytest.mark.parametrize(
     ("source", "settings", "told"),
     [
