@@ -7,6 +7,8 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -226,6 +228,19 @@ def test_own_problem_from_a_file(own_problem: Path, tmp_path: Path) -> None:
     assert Solution.load(folder / "solution").problem.name == "shift"
 
 
+def test_columns_are_as_wide_as_the_longest_name_needs(
+    own_problem: Path, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    own_problem.write_text(OWN_PROBLEM.replace('"x"', '"longitude"'), encoding="utf-8")
+    assert main([f"problem={own_problem}:shift", "record=minimal", f"hydra.run.dir='{tmp_path / 'run'}'"]) == 0
+    report = (tmp_path / "run" / "report.md").read_text(encoding="utf-8")
+    for text in (capsys.readouterr().out, report):
+        (line,) = (line for line in text.splitlines() if line.startswith("end of longitude"))
+        (below,) = (line for line in text.splitlines() if line.startswith("CPU time"))
+        assert line[16:18] == below[16:18] == "  "
+        assert " " not in line[18] + below[18]
+
+
 @pytest.mark.parametrize(
     ("source", "settings", "told"),
     [
@@ -275,9 +290,12 @@ def test_interrupted_run_keeps_records_and_a_solution(number: signal.Signals, tm
     # a ladder long enough to be interrupted in the middle
     slow = ["continuation=tanh_ladder", "continuation.count=2000", "ansatz.size=40", "nodes.n_nodes=80"]
     command = [sys.executable, "-m", "ponn_torch.cli", *LANDING, *slow, f"hydra.run.dir='{folder}'"]
-    with subprocess.Popen(
-        command, cwd=tmp_path, env=os.environ, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-    ) as process:
+    with (
+        interruptible(),
+        subprocess.Popen(
+            command, cwd=tmp_path, env=os.environ, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        ) as process,
+    ):
         deadline = time.monotonic() + 60
         while time.monotonic() < deadline and process.poll() is None:
             records = folder / "records.jsonl"
@@ -293,6 +311,16 @@ def test_interrupted_run_keeps_records_and_a_solution(number: signal.Signals, tm
     assert events_in(folder).count("stage") >= 2
     assert Solution.load(folder / "solution").smoothing is not None
     assert outcome_in(folder)["exit_code"] == 130
+
+
+@contextmanager
+def interruptible() -> Iterator[None]:
+    """Processes started here take interrupts, which those of a shell's background job inherit as ignored."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 def events_in_progress(records: Path) -> int:

@@ -21,8 +21,8 @@ from ponn_torch.reporting.members import BESIDES, SOLUTION
 from ponn_torch.reporting.recorder import Recorder
 from ponn_torch.reporting.records import RECORDS, RunRecorder, recorded
 from ponn_torch.reporting.reference import Reference
-from ponn_torch.reporting.report import end_error_lines, verdict_table, write_report
-from ponn_torch.reporting.style import number, unit
+from ponn_torch.reporting.report import end_error_rows, verdict_table, write_report
+from ponn_torch.reporting.style import columns, number, unit
 from ponn_torch.settings import ConfigError, one_line, users_line
 from ponn_torch.solving.certificate import Certificate
 from ponn_torch.solving.journal import ForeignJournal, Journal
@@ -231,19 +231,19 @@ def _screen(outcome: Outcome, folder: Path, plan: Plan | None, keeper: _Keeper, 
         # the progress has shown the verdict, which opens the table
         first = 2 if plan is not None and plan.recording.progress else 0
         lines += [*verdict_table(certificate)[first:], ""]
+    rows: list[tuple[str, str]] = []
     if plan is not None and outcome.cost is not None:
-        lines += _found(outcome, plan.problem, smoothed=keeper.best is not None and keeper.best.smoothing is not None)
+        rows += _found(outcome, plan.problem, smoothed=keeper.best is not None and keeper.best.smoothing is not None)
     if plan is not None and certificate is not None:
-        lines += end_error_lines(certificate, plan.problem)
+        rows += end_error_rows(certificate, plan.problem)
     solving = sum(stage.cpu_seconds for stage in keeper.stages)
-    lines.append(f"{'CPU time':12}{solving:.1f} s solving, {seconds:.1f} s in all")
-    lines.append(f"{'folder':12}{folder}")
+    rows += [("CPU time", f"{solving:.1f} s solving, {seconds:.1f} s in all"), ("folder", str(folder))]
     if outcome.exit_code != DONE and (certificate is None or outcome.message != certificate.verdict):
-        lines.append(f"{'ended':12}{outcome.message}")
-    return "\n".join(lines)
+        rows.append(("ended", outcome.message))
+    return "\n".join([*lines, *columns(rows)])
 
 
-def _found(outcome: Outcome, problem: OptimalControlProblem, *, smoothed: bool) -> list[str]:
+def _found(outcome: Outcome, problem: OptimalControlProblem, *, smoothed: bool) -> list[tuple[str, str]]:
     """Cost, final time and switches, in the units that people read."""
     cost, clock, known = unit(problem, "cost"), unit(problem, "time"), ""
     assert outcome.cost is not None
@@ -252,14 +252,14 @@ def _found(outcome: Outcome, problem: OptimalControlProblem, *, smoothed: bool) 
         what = "optimum without smoothing" if smoothed else "known optimum"
         known = f"; {what} {outcome.known_cost / cost.size:.10g}, difference {excess:+.1e}"
     doubt = "" if outcome.certified else ", NOT certified"
-    lines = [f"{problem.cost_name:12}{number(outcome.cost, cost, '.10g')}{doubt}{known}"]
+    rows = [(problem.cost_name, f"{number(outcome.cost, cost, '.10g')}{doubt}{known}")]
     if outcome.final_time is not None:
-        lines.append(f"{'final time':12}{number(outcome.final_time, clock, '.10g')}")
+        rows.append(("final time", number(outcome.final_time, clock, ".10g")))
     if outcome.switch_times:
         *before, last = outcome.switch_times
         times = [f"{time / clock.size:.9g}" for time in before] + [number(last, clock, ".9g")]
-        lines.append(f"{'switches':12}{', '.join(times)} ({'-'.join(outcome.arcs)})")
-    return lines
+        rows.append(("switches", f"{', '.join(times)} ({'-'.join(outcome.arcs)})"))
+    return rows
 
 
 TOOL = Tool(PONN, build, run, member, resume)

@@ -18,7 +18,7 @@ import ponn_torch
 from ponn_torch.optimal_control.problem import FreeTime, OptimalControlProblem
 from ponn_torch.reporting.figures import all_figures
 from ponn_torch.reporting.recorder import finite_or_none
-from ponn_torch.reporting.style import arc_intervals, number, save, unit
+from ponn_torch.reporting.style import arc_intervals, columns, number, save, unit
 from ponn_torch.solving.certificate import Certificate
 from ponn_torch.solving.result import StageResult
 from ponn_torch.solving.solution import Solution
@@ -213,21 +213,21 @@ def verdict_table(certificate: Certificate) -> list[str]:
     return "\n".join(lines[:last]).rstrip().splitlines()
 
 
-def end_error_lines(certificate: Certificate, problem: OptimalControlProblem) -> list[str]:
+def end_error_rows(certificate: Certificate, problem: OptimalControlProblem) -> list[tuple[str, str]]:
     """How far both flights end off, in the units that people read."""
-    lines = []
+    rows: list[tuple[str, str]] = []
     for name, flown in certificate.end_errors.items():
         shown = unit(problem, name)
         errors = (number(value, shown, ".1e") for value in (flown, certificate.control_end_errors[name]))
-        lines.append("{:12}{} flown, {} by the control alone".format(f"end of {name}", *errors))
-    return lines
+        rows.append((f"end of {name}", "{} flown, {} by the control alone".format(*errors)))
+    return rows
 
 
 def _certificate(certificate: Certificate, problem: OptimalControlProblem) -> str:
     flown = number(certificate.flown_cost, unit(problem, "cost"), ".10g")
-    lines = [*verdict_table(certificate), "", *end_error_lines(certificate, problem)]
-    lines += [f"{certificate.cost_name:12}{flown} flown", f"{'CPU time':12}{certificate.seconds:.2f} s"]
-    return "\n".join(["## Certificate", "", "```", *lines, "```"])
+    rows = end_error_rows(certificate, problem)
+    rows += [(certificate.cost_name, f"{flown} flown"), ("CPU time", f"{certificate.seconds:.2f} s")]
+    return "\n".join(["## Certificate", "", "```", *verdict_table(certificate), "", *columns(rows), "```"])
 
 
 def _stages(stages: Sequence[StageResult], solution: Solution | None) -> str:

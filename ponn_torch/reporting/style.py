@@ -138,6 +138,12 @@ def number(value: float, shown: DisplayUnit, form: str = ".7g") -> str:
     return f"{value / shown.size:{form}} {shown.label}".rstrip()
 
 
+def columns(rows: Sequence[tuple[str, str]]) -> list[str]:
+    """A line for every label and what it stands for, which begins in the same column."""
+    width = max([12, *(len(label) + 2 for label, _ in rows)])
+    return [f"{label:{width}}{text}" for label, text in rows]
+
+
 def arc_intervals(solution: Solution) -> list[tuple[float, float, str]]:
     """(start, end, label) of every arc, in s; [] where the solution is not split."""
     if not solution.arcs:
