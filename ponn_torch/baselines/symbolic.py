@@ -62,7 +62,10 @@ class _OnSymbols(fx.Interpreter):
         name = target.__name__.split(".")[0]
         operation = _operations().get(name)
         if operation is None:
-            raise ValueError(f"no CasADi counterpart of torch operation {name!r}; allowed: {', '.join(_operations())}")
+            raise ValueError(
+                f"no CasADi counterpart of torch operation {name!r}; allowed: elementary functions, sums, extremes and "
+                "norms, constant indices, products of matrices and small linear systems, nothing in place"
+            )
         meant = {key: value for key, value in kwargs.items() if key not in MEANINGLESS}
         try:
             found = operation(*fx.node.map_aggregate(args, _as_array), **fx.node.map_aggregate(meant, _as_array))
