@@ -60,7 +60,7 @@ def at_turned_switches(curve: Curve, tolerance: float) -> Structure | None:
 
     Nor where such an arc would not be admissible: wrong arcs turn S round in many ways.
     """
-    if not curve.collocation.bvp.law.jumps or curve.collocation.setting.regime.arcs is None:
+    if not curve.collocation.bvp.law.jumps:
         return None
     claimed = claimed_structure(curve)
     t, _, depth = depth_along(curve, claimed)
@@ -84,18 +84,19 @@ def _plausible(curve: Curve, structure: Structure) -> bool:
 
 def violation(curve: Curve, n_points: int = 201) -> float:
     """How far the control leaves its range on singular arcs, in ranges; infinite where Legendre and Clebsch's b ≤ 0."""
+    arcs = curve.collocation.setting.regime.arcs
+    if not singular_components(curve.collocation.bvp.law, arcs):
+        return 0.0
+    assert arcs is not None
     z = torch.linspace(-1.0, 1.0, n_points, dtype=curve.xi.dtype, device=curve.xi.device)
     t, _, _, segment = curve.on_segments(z)
-    arcs = curve.collocation.setting.regime.arcs
-    return 0.0 if arcs is None else _violation(curve, t, arcs[segment])
+    return _violation(curve, t, arcs[segment])
 
 
 def _violation(curve: Curve, t: Tensor, arcs: Tensor) -> float:
     """The same at scaled times (m,) for arc codes (m, k)."""
     bvp = curve.collocation.bvp
     components = singular_components(bvp.law, arcs)
-    if not components:
-        return 0.0
     parameters = curve.setting(torch.zeros_like(t, dtype=torch.long)).parameters
     setting = Setting(Regime(arcs=arcs), parameters)
     fraction, bend = singular_control(with_singular_arcs(bvp, components), t[:, None], curve(t), setting)

@@ -229,8 +229,8 @@ class Split(Segmentation, Refinement):
             return [merged]
         if not solved:
             return []
-        singular = singular_arcs.at_turned_switches(curve, self.sign_tolerance)
         regular = needles(curve, self.needle, self.sign_tolerance)
+        singular = singular_arcs.at_turned_switches(curve, self.sign_tolerance) if regular else None
         return regular if singular is None else [singular, *regular]
 
 
