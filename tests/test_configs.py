@@ -14,6 +14,7 @@ from ponn_torch.ansatz.basis import LinearBasis
 from ponn_torch.build import Plan, build
 from ponn_torch.cli.run import run
 from ponn_torch.optimal_control.problem import FreeTime
+from ponn_torch.optimal_control.references import load_problem
 from ponn_torch.settings import ROOMS, target
 from ponn_torch.solving import run as run_module
 from ponn_torch.solving.certificate import Certificate
@@ -28,6 +29,16 @@ REFERENCE = "problem.reference='ponn_torch.problems.mars_landing:mars_landing'"
 DATA = Path(__file__).parent / "landing.csv"
 # What a config cannot do without.
 NEEDED = {"custom": [REFERENCE], "file": [f"data.path='{DATA}'", "problem=mars_landing"]}
+
+
+@pytest.fixture(scope="module", autouse=True)
+def solved(tmp_path_factory: pytest.TempPathFactory) -> None:
+    """A solution to restart from."""
+    folder = tmp_path_factory.mktemp("solved")
+    solution = Solver().solve(load_problem("ponn_torch.problems.mars_landing:mars_landing")).solution
+    assert solution is not None
+    solution.save(folder)
+    NEEDED["solution"] = [f"guess.solution='{folder}'", "problem=mars_landing"]
 
 
 def overrides_of(group: str, option: str) -> list[str]:
@@ -140,7 +151,6 @@ INSTEAD = {
     "enrichment": ["refinement.last=0.5"],
     "switch_neurons": ["refinement.last=0.5"],
     "subdivide": ["refinement.max_rounds=1", "refinement.stopping.max_iterations=2"],
-    **NEEDED,
     "adam_lbfgs": [f"optimizer.parts.{i}.stopping.max_iterations=2" for i in (0, 1)],
     "adam_lm": [f"optimizer.parts.{i}.stopping.max_iterations=2" for i in (0, 1)],
     "variable_projection": ["ansatz=mlp", "ansatz.hidden=[6,6]", "optimizer.optimizer.stopping.max_iterations=2"],
@@ -174,7 +184,7 @@ def tiny(group: str, option: str) -> list[str]:
             chosen["refinement.stopping"] = "refinement.stopping.max_iterations=2"
     elif group == "ansatz":
         chosen.pop("ansatz.size")
-    for text in [f"{group}={option}", *INSTEAD.get(group, []), *INSTEAD.get(option, [])]:
+    for text in [*overrides_of(group, option), *INSTEAD.get(group, []), *INSTEAD.get(option, [])]:
         chosen[text.split("=")[0]] = text
     for key in ABSENT.get(option, []):
         chosen.pop(key, None)

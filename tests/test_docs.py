@@ -35,6 +35,8 @@ def test_python_runs_from_top_to_bottom(tmp_path: Path, monkeypatch: pytest.Monk
     exec(first, names)
     assert names["result"].certified
     assert names["again"].cost == pytest.approx(268.0146563274, abs=1e-6)
+    assert [stage.name for stage in names["later"].stages] == ["split"]
+    assert names["later"].certified
     exec(problem, names)
     exec(solve, names)
     own = names["result"]

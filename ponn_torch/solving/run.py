@@ -15,6 +15,7 @@ from ponn_torch.solving import refinement as refinements
 from ponn_torch.solving.certificate import Certificate, certify
 from ponn_torch.solving.guess import STREAMS, project
 from ponn_torch.solving.refinement import Refinement
+from ponn_torch.solving.restart import Restart
 from ponn_torch.solving.result import SolveResult
 from ponn_torch.solving.solution import Solution
 from ponn_torch.solving.stages import Interrupted, Stages
@@ -104,6 +105,9 @@ class Run:
 
     def _one_start(self, collocation: Collocation, xi: Tensor) -> tuple[Solution | None, str]:
         """Everything between a first guess and a trajectory to be judged; None and why where that fails."""
+        restarted = self._restarted()
+        if restarted is not None:
+            return restarted, ""
         stages, message = self._continuation(collocation, xi)
         if not stages:
             self.causes.append("not through the first stages")
@@ -130,6 +134,17 @@ class Run:
             return candidate, judged
         closer = certify(again, self.solver.tolerances)
         return (again, closer) if closer.certified else (candidate, judged)
+
+    def _restarted(self) -> Solution | None:
+        """The arcs of a solution that the first start begins with, refined; None where there are none or that fails."""
+        guess, refinement = self.solver.guess, self.solver.refinement
+        if self.stages.start or not isinstance(guess, Restart) or refinement is None or not refinement.reads_arcs:
+            return None
+        curve = guess.on_its_arcs(self.stages.bvp)
+        if curve is None:
+            return None
+        refined, note = self._refine(refinement, Solution(curve), None)
+        return None if note else refined
 
     # -- smoothed stages ---------------------------------------------------------------------------------------------
 

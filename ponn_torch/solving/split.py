@@ -115,7 +115,8 @@ class Split(Segmentation, Refinement):
         for smoothed, n_segments in self._starts(search, start):
             if rounds and rounds[-1].status.cut:
                 return search.rounds.interrupted()
-            structures = [find_structure(smoothed, polish=0)]
+            claimed = smoothed.collocation.setting.regime.arcs is not None
+            structures = [claimed_structure(smoothed) if claimed else find_structure(smoothed, polish=0)]
             if smoothed.smoothing:
                 rungs.append((smoothed.smoothing, undecided(smoothed, smoothed.smoothing)))
                 singular = singular_interval(rungs)
