@@ -110,7 +110,7 @@ def test_a_saved_solution_serves_by_the_name_of_its_folder(tmp_path):
     ("given", "message"),
     [
         ("nowhere", "guess.solution = 'nowhere'; allowed: the folder of a run or a solution"),
-        ("zermelo", r"guess.solution: states = \{'x': 1, 'y': 1\}; allowed: \{'r': 3, 'v': 3, 'm': 1\}"),
+        ("minimum_time", r"guess.solution: states = \{'x': 1, 'v': 1\}; allowed: \{'r': 3, 'v': 3, 'm': 1\}"),
     ],
 )
 def test_what_cannot_serve_is_refused(given, message):
