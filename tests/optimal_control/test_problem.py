@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import partial
 from typing import Any
 
 import pytest
@@ -36,6 +37,10 @@ def bounded(minimum: str) -> dict[str, Any]:
     return {"control": Box("force", 1.0, minimum, size=2), "parameters": {"strength": -1.0}}
 
 
+def one_argument(t: torch.Tensor) -> dict[str, torch.Tensor]:
+    return {"position": t, "velocity": t}
+
+
 SLIPS: list[tuple[dict[str, Any], str]] = [
     ({"initial": {"positoin": 0.0}}, "initial names 'positoin'; .*did you mean 'position'"),
     ({"final": {"velocitty": 0.0}}, "final names 'velocitty'; .*did you mean 'velocity'"),
@@ -64,6 +69,12 @@ SLIPS: list[tuple[dict[str, Any], str]] = [
     (rates(velocity=torch.zeros(5, 3)), r"dynamics\['velocity'\] has shape \(5, 3\); \(..., 2\) is needed"),
     ({"running_cost": lambda t, x, u, p: u.force**2}, r"running_cost returns shape \(5, 2\); \(..., 1\)"),
     ({"running_cost": lambda t, x, u, p: (u.force**2).sum(-1)}, r"running_cost returns shape \(5,\)"),
+    ({"terminal_cost": lambda x, p: x.position}, r"terminal_cost takes \(x, p\); terminal_cost\(t, x, p\) is expected"),
+    ({"terminal_manifold": lambda t, x, u, p: x.position}, r"takes \(t, x, u, p\); terminal_manifold\(t, x, p\) is"),
+    ({"running_cost": lambda t, x, u, p, *, k: t}, r"takes \(t, x, u, p, \*, k\); running_cost\(t, x, u, p\) is"),
+    ({"dynamics": one_argument}, r"dynamics takes \(t\); dynamics\(t, x, u, p\) is expected"),
+    ({"dynamics": None}, r"dynamics = None; a function dynamics\(t, x, u, p\) is expected"),
+    ({"terminal_cost": 1.0}, r"terminal_cost = 1.0; a function terminal_cost\(t, x, p\) is expected"),
     ({"terminal_cost": lambda t, x, p: x.position}, r"terminal_cost returns shape \(5, 2\); \(..., 1\)"),
 ]
 
@@ -72,6 +83,22 @@ SLIPS: list[tuple[dict[str, Any], str]] = [
 def test_slips_are_named_when_the_problem_is_stated(changes, message):
     OptimalControlProblem(**statement())
     with pytest.raises(ValueError, match=f"push: .*{message}"):
+        OptimalControlProblem(**statement(**changes))
+
+
+def test_functions_may_be_of_any_kind_that_takes_the_arguments():
+    def energy(t, x, u, p, weight=0.5):
+        return weight * (u.force**2).sum(-1, keepdim=True)
+
+    class Terminal:
+        def __call__(self, *arguments):
+            return arguments[1].position[..., :1]
+
+    for changes in (
+        {"running_cost": energy},
+        {"running_cost": partial(energy, weight=2.0)},
+        {"terminal_cost": Terminal()},
+    ):
         OptimalControlProblem(**statement(**changes))
 
 
