@@ -52,6 +52,12 @@ class DisplayUnit:
     label: str
     size: float = 1.0
 
+    def __post_init__(self) -> None:
+        if not isinstance(self.label, str):
+            raise ValueError(f"DisplayUnit: label = {self.label!r}; a text is needed")
+        if not (finite(self.size) and self.size > 0):
+            raise ValueError(f"DisplayUnit: size = {self.size!r}; a positive number is needed")
+
 
 @dataclass(frozen=True)
 class ProblemOrigin:
@@ -81,6 +87,7 @@ class OptimalControlProblem:
         terminal_manifold: ψ(t, x, p) → (..., k) that must vanish at the end, or None.
         parameters: named numbers that may be varied at run time (continuation, batches): ``p.name``.
         mass: name of the state that a change of mass variable applies to, with ``exhaust_velocity`` in m/s.
+        display: state, control, ``time`` or ``cost`` → unit for people; ``origin`` → name of the body there.
         known_cost: the optimum in SI where it is known, for reports.
         origin: the call that made the problem (``load_problem``). A changed copy has none, so that no saved
             solution ever names a call that makes another problem.
@@ -140,6 +147,7 @@ class OptimalControlProblem:
             if isinstance(bound, str) and bound not in self.parameters:
                 hint = nearest(bound, ["a number", *self.parameters])
                 raise ValueError(f"{self.name}: {label} of the control = {bound!r}; {hint}")
+        self._check_display()
         self._check_signatures()
         self._probe()
 
@@ -224,6 +232,16 @@ class OptimalControlProblem:
         return f"{size}; unknowns should be of order one: set units[{name!r}] to about {float(f'{value:.0e}'):g}"
 
     # -- checks ----------------------------------------------------------------------------------------------
+
+    def _check_display(self) -> None:
+        allowed = [*self.states, *self.control.names, "time", "cost", "origin"]
+        given: Mapping[str, object] = self.display
+        for name, shown in given.items():
+            if name not in allowed:
+                raise ValueError(f"{self.name}: display names {name!r}; {nearest(name, allowed)}")
+            if not isinstance(shown, DisplayUnit):
+                hint = "DisplayUnit(label, size), as in DisplayUnit('km', 1e3)"
+                raise ValueError(f"{self.name}: display[{name!r}] = {shown!r}; allowed: {hint}")
 
     def _check_signatures(self) -> None:
         """Python would only count arguments, and name a lambda by nothing."""
