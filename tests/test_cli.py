@@ -242,6 +242,32 @@ def test_columns_are_as_wide_as_the_longest_name_needs(
 
 
 @pytest.mark.parametrize(
+    ("settings", "told"),
+    [
+        ([], True),
+        (["n_certified=2"], False),  # compared
+        (["n_starts=1"], False),  # there is no other
+        (["refinement=none"], False),  # the first one through is the result, whatever n_certified says
+    ],
+)
+def test_the_first_extremal_is_not_said_to_be_the_best(
+    settings: list[str], told: bool, own_problem: Path, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    arguments = [f"problem={own_problem}:shift", "record=minimal", *settings]
+    assert main([*arguments, f"hydra.run.dir='{tmp_path / 'run'}'"]) == 0
+    assert outcome_in(tmp_path / "run")["certified"]
+    row = "\nextremal    the first one certified, perhaps not the best; n_certified=5"
+    assert (row in capsys.readouterr().out) is told
+
+
+def test_a_known_optimum_tells_what_an_extremal_is_worth(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    assert main(["problem=double_integrator_time", "record=minimal", f"hydra.run.dir='{tmp_path}'"]) == 0
+    printed = capsys.readouterr().out
+    assert "; known optimum 2, difference" in printed
+    assert "\nextremal " not in printed
+
+
+@pytest.mark.parametrize(
     ("source", "settings", "told"),
     [
         ("", ["broken"], "my problem.py:22: NameError: name 'undefined_name' is not defined"),

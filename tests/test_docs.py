@@ -2,6 +2,7 @@
 
 import re
 import shlex
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,7 @@ from ponn_torch.build import build
 from ponn_torch.cli.flight import build as build_flight
 from ponn_torch.cli.overrides import PONN as PONN_APPLICATION
 from ponn_torch.cli.overrides import RHC, Application, groups, read
+from ponn_torch.optimal_control.problem import SIGNATURES, OptimalControlProblem
 
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
@@ -78,6 +80,20 @@ def test_table_of_groups_is_complete(application: Application, header: str) -> N
             continue
         for option in set(options) - {"custom"}:  # which a reference stands for
             assert f"`{option}`" in rows[name], f"{name}={option} is missing from the table of docs/"
+
+
+def test_table_of_fields_is_complete() -> None:
+    table = TEXT.partition("| field |")[2].partition("\n\n")[0]
+    named = re.findall(r"`([^`]+)`", " ".join(re.findall(r"^\| (`.*?) \|", table, re.MULTILINE)))
+    signatures = {name: f"{name}({', '.join(arguments)})" for name, arguments in SIGNATURES.items()}
+    stated = [signatures.get(field.name, field.name) for field in fields(OptimalControlProblem) if field.init]
+    assert sorted(named) == sorted(stated)
+
+
+def test_sections_that_are_linked_exist() -> None:
+    titles = re.findall(r"^#+ (.*)$", TEXT, re.MULTILINE)
+    known = {re.sub(r"[^\w -]", "", title).lower().replace(" ", "-") for title in titles}
+    assert set(re.findall(r"\]\([^)#:]*#([^)]*)\)", TEXT)) <= known
 
 
 @pytest.mark.parametrize(("page", "link"), sorted(set(LINKED)), ids=lambda x: str(getattr(x, "name", x)))

@@ -234,6 +234,7 @@ def _screen(outcome: Outcome, folder: Path, plan: Plan | None, keeper: _Keeper, 
     rows: list[tuple[str, str]] = []
     if plan is not None and outcome.cost is not None:
         rows += _found(outcome, plan.problem, smoothed=keeper.best is not None and keeper.best.smoothing is not None)
+        rows += _of_several(outcome, plan)
     if plan is not None and certificate is not None:
         rows += end_error_rows(certificate, plan.problem)
     solving = sum(stage.cpu_seconds for stage in keeper.stages)
@@ -260,6 +261,15 @@ def _found(outcome: Outcome, problem: OptimalControlProblem, *, smoothed: bool) 
         times = [f"{time / clock.size:.9g}" for time in before] + [number(last, clock, ".9g")]
         rows.append(("switches", f"{', '.join(times)} ({'-'.join(outcome.arcs)})"))
     return rows
+
+
+def _of_several(outcome: Outcome, plan: Plan) -> list[tuple[str, str]]:
+    """How to look for a better extremal, where no known optimum tells what the first certified one is worth."""
+    solver = plan.solver
+    first = solver.exact and solver.n_certified == 1 and solver.n_starts > 1
+    if not (first and outcome.certified and outcome.known_cost is None):
+        return []
+    return [("extremal", "the first one certified, perhaps not the best; n_certified=5 keeps the cheapest of five")]
 
 
 TOOL = Tool(PONN, build, run, member, resume)

@@ -34,7 +34,7 @@ Other options: -m sweep over lists of values, --config-groups, --version, --hydr
 A run leaves in its folder: config.yaml, overrides.yaml, records.jsonl, TensorBoard events, solution/,
 certificate.json, figures/, report.md, environment.json, outcome.json; failure.txt if something went wrong.
 
-Exit code: 0 certified (finished, where the refinement claims no certificate), 1 bad input, 2 not certified,
+Exit code: 0 certified (solved, where the refinement claims no certificate), 1 bad input, 2 not certified,
 3 an error inside, 130 interrupted.\
 """
 

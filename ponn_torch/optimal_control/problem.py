@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from difflib import get_close_matches
@@ -14,6 +15,12 @@ from torch import Tensor
 from ponn_torch.optimal_control.control_laws import Bounded
 from ponn_torch.optimal_control.control_set import ControlSet, finite
 
+SIGNATURES = {  # what the functions of a problem are called with
+    "dynamics": ("t", "x", "u", "p"),
+    "running_cost": ("t", "x", "u", "p"),
+    "terminal_cost": ("t", "x", "p"),
+    "terminal_manifold": ("t", "x", "p"),
+}
 StateValues = Mapping[str, float | Sequence[float | None] | None]
 
 
@@ -45,6 +52,12 @@ class DisplayUnit:
     label: str
     size: float = 1.0
 
+    def __post_init__(self) -> None:
+        if not isinstance(self.label, str):
+            raise ValueError(f"DisplayUnit: label = {self.label!r}; a text is needed")
+        if not (finite(self.size) and self.size > 0):
+            raise ValueError(f"DisplayUnit: size = {self.size!r}; a positive number is needed")
+
 
 @dataclass(frozen=True)
 class ProblemOrigin:
@@ -74,6 +87,7 @@ class OptimalControlProblem:
         terminal_manifold: ψ(t, x, p) → (..., k) that must vanish at the end, or None.
         parameters: named numbers that may be varied at run time (continuation, batches): ``p.name``.
         mass: name of the state that a change of mass variable applies to, with ``exhaust_velocity`` in m/s.
+        display: state, control, ``time`` or ``cost`` → unit for people; ``origin`` → name of the body there.
         known_cost: the optimum in SI where it is known, for reports.
         origin: the call that made the problem (``load_problem``). A changed copy has none, so that no saved
             solution ever names a call that makes another problem.
@@ -133,6 +147,8 @@ class OptimalControlProblem:
             if isinstance(bound, str) and bound not in self.parameters:
                 hint = nearest(bound, ["a number", *self.parameters])
                 raise ValueError(f"{self.name}: {label} of the control = {bound!r}; {hint}")
+        self._check_display()
+        self._check_signatures()
         self._probe()
 
     # -- sizes and slices ------------------------------------------------------------------------------------
@@ -216,6 +232,35 @@ class OptimalControlProblem:
         return f"{size}; unknowns should be of order one: set units[{name!r}] to about {float(f'{value:.0e}'):g}"
 
     # -- checks ----------------------------------------------------------------------------------------------
+
+    def _check_display(self) -> None:
+        allowed = [*self.states, *self.control.names, "time", "cost", "origin"]
+        given: Mapping[str, object] = self.display
+        for name, shown in given.items():
+            if name not in allowed:
+                raise ValueError(f"{self.name}: display names {name!r}; {nearest(name, allowed)}")
+            if not isinstance(shown, DisplayUnit):
+                hint = "DisplayUnit(label, size), as in DisplayUnit('km', 1e3)"
+                raise ValueError(f"{self.name}: display[{name!r}] = {shown!r}; allowed: {hint}")
+
+    def _check_signatures(self) -> None:
+        """Python would only count arguments, and name a lambda by nothing."""
+        for label, arguments in SIGNATURES.items():
+            function, expected = getattr(self, label), f"{label}({', '.join(arguments)})"
+            if function is None and label != "dynamics":
+                continue
+            if not callable(function):
+                raise ValueError(f"{self.name}: {label} = {function!r}; a function {expected} is expected")
+            try:
+                signature = inspect.signature(function)
+            except (TypeError, ValueError):  # of what is written in C
+                continue
+            try:
+                signature.bind(*arguments)
+            except TypeError:
+                plain = [argument.replace(annotation=argument.empty) for argument in signature.parameters.values()]
+                taken = signature.replace(parameters=plain, return_annotation=signature.empty)
+                raise ValueError(f"{self.name}: {label} takes {taken}; {expected} is expected") from None
 
     def _probe(self) -> None:
         """Call the user's functions once with shapes (5, ·), so that a slip is named here, not in the solver."""

@@ -23,7 +23,6 @@ _DISPLAY = {
     "time": DisplayUnit("d", DAY),
     "r": DisplayUnit("km", KILOMETRE),
     "v": DisplayUnit("km/s", KILOMETRE),
-    "m": DisplayUnit("kg"),
     "origin": DisplayUnit("Sun"),
 }
 
@@ -118,5 +117,5 @@ def energy_transfer_limited(
         mass="m",
         cost_name="effort",
         known_cost=known_cost,
-        display={**_DISPLAY, "cost": DisplayUnit("d", DAY), "thrust": DisplayUnit("N")},
+        display={**_DISPLAY, "m": DisplayUnit("kg"), "cost": DisplayUnit("d", DAY), "thrust": DisplayUnit("N")},
     )

@@ -45,6 +45,11 @@ class Comparison:
         return extremals(self.members)
 
     @cached_property
+    def smoothed(self) -> bool:
+        """Some member ended at a smoothing, so that it solved another problem than the one stated."""
+        return any(member.smoothing > 0 for member in self.members)
+
+    @cached_property
     def errors(self) -> dict[Path, dict[str, float]]:
         """Errors of states and costates of every solution, in the problem's units."""
         if self.reference is None:
@@ -77,6 +82,10 @@ class Comparison:
             "member": member.folder.name,
             "certified": member.certified,
             "extremal": self.extremals.get(member.folder, "–"),
+        }
+        if self.smoothed:
+            row["smoothing ρ"] = member.smoothing
+        row |= {
             name: member.cost / size,
             "cost − known": math.nan if known is None else (member.cost - known) / size,
             "‖r‖": member.norm,
@@ -114,9 +123,10 @@ class Comparison:
             "extremals": " ".join(f"{letter}:{count}" for letter, count in sorted(found.items())),
         }
         whole = ("unknowns", "iterations", "residuals", "derivatives")
+        forms = {self.cost_unit[0]: ".8g", "smoothing ρ": ".3g"}
         left_out = {"problem", "settings", "seed", "member", "certified", "extremal", "result"}
         for name in (name for name in runs[0] if name not in left_out):
-            digits = ".0f" if name in whole else ".8g" if name == self.cost_unit[0] else ".2g"
+            digits = ".0f" if name in whole else forms.get(name, ".2g")
             row[name] = spread((run[name] for run in runs), digits)
         return row
 
@@ -201,6 +211,11 @@ def write_comparison(comparisons: Sequence[Comparison], folder: Path, figures: M
         "cheapest, – where no residual was solved. Failed: bad input, an error or an interruption. ‖r‖, off nodes "
         "and errors are scaled; CPU s without certificates."
     )
+    if any(comparison.smoothed for comparison in comparisons):
+        lines.append(
+            "Smoothing ρ: that of the solution which is kept, 0 without. Every ρ makes a problem of its own: where "
+            "runs differ in it, letters begin anew at each, and their costs say nothing of which run is better."
+        )
     lines += [f"![{caption}]({path.name})" for caption, path in figures.items()]
     text = "\n\n".join(lines) + "\n"
     (folder / COMPARISON).write_text(text, encoding="utf-8")

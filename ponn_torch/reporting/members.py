@@ -53,6 +53,13 @@ class Member:
             return None
 
     @property
+    def smoothing(self) -> float:
+        """ρ of the solution that is kept, 0 where none is in force, NaN without a solution."""
+        if self.solution is None:
+            return math.nan
+        return self.solution.smoothing or 0.0
+
+    @property
     def ran(self) -> bool:
         """It ended by itself, certified or not: no bad input, no error, no interruption."""
         return self.outcome["exit_code"] in (0, 2)
@@ -161,11 +168,31 @@ def extremals(members: Sequence[Member], cost: float = 1e-3, costates: float = 1
     """A letter for every member that found an extremal, the same for the same one, A for the cheapest.
 
     Two are the same if costs agree to ``cost``, relative, and initial costates to ``costates`` of the largest one.
+    Every ρ makes a problem of its own: where members differ in it, letters begin anew at each, and say at which.
     """
-    found = sorted((m for m in members if m.solved and math.isfinite(m.cost)), key=lambda member: member.cost)
+    found = [member for member in members if member.solved and math.isfinite(member.cost)]
+    alike: dict[str, list[Member]] = {}
+    for member in sorted(found, key=lambda member: member.cost):
+        alike.setdefault(_at(member.smoothing), []).append(member)
+    return {
+        folder: letter + (at if len(alike) > 1 else "")
+        for at, group in alike.items()
+        for folder, letter in _letters(group, cost, costates).items()
+    }
+
+
+def _at(smoothing: float) -> str:
+    """What tells the extremals of one ρ from those of another."""
+    if math.isnan(smoothing):
+        return " (ρ unknown)"
+    return f" (ρ {smoothing:.3g})" if smoothing else ""
+
+
+def _letters(members: Sequence[Member], cost: float, costates: float) -> dict[Path, str]:
+    """Letters of members of one ρ, the cheapest first."""
     leaders: list[tuple[float, torch.Tensor | None]] = []
     out = {}
-    for member in found:
+    for member in members:
         start = None
         if member.solution is not None:
             start = member.solution.curve.knots[0][member.solution.bvp.n_states :].double().cpu()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import json
+import math
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -57,6 +58,7 @@ def save_curve(curve: Curve, folder: Path) -> None:
             "name": bvp.problem.name,
             "reference": None if origin is None else relative_reference(origin.reference, folder),
             "arguments": None if origin is None else dict(origin.arguments),
+            "stated": _stated(bvp.problem),
         },
         "mass_variable": bvp.mass_variable,
         "chains": [asdict(chain) for chain in bvp.chains],
@@ -98,6 +100,7 @@ def load_curve(folder: Path, problem: OptimalControlProblem | None = None) -> Cu
             f"{folder / SOLUTION}: problem = {problem.name!r}; allowed: {description['problem']['name']!r}, "
             "which was solved"
         )
+    _check_stated(problem, description["problem"].get("stated", {}), folder)
     chains = tuple(Chain(tuple(c["columns"]), tuple(c["factors"]), bool(c["trivial"])) for c in description["chains"])
     xi = arrays["xi"]
     bvp = pontryagin(problem, mass_variable=description["mass_variable"], chains=False, dtype=xi.dtype)
@@ -140,6 +143,29 @@ def _make_problem(saved: dict[str, Any], folder: Path) -> OptimalControlProblem:
             "made again; pass it: Solution.load(folder, problem=...)"
         )
     return load_problem(resolved_reference(saved["reference"], folder), **saved["arguments"])
+
+
+def _stated(problem: OptimalControlProblem) -> dict[str, float | str]:
+    """Ends, final time and parameters, each by its name, SI."""
+    out: dict[str, float | str] = {}
+    for end in ("initial", "final"):
+        values = zip(problem.component_names, problem.boundary(end), strict=True)
+        out |= {f"{end} {name}": "free" if value is None else value for name, value in values}
+    out["final_time"] = "free" if problem.free_final_time else problem.time_guess
+    return out | {f"parameters[{name!r}]": float(value) for name, value in problem.parameters.items()}
+
+
+def _check_stated(problem: OptimalControlProblem, saved: dict[str, float | str], folder: Path) -> None:
+    """Say by name in what the problem differs; what was saved before these were has none."""
+    found = _stated(problem) if saved else {}
+    others = []
+    for name in {**found, **saved}:
+        now, then = found.get(name, "absent"), saved.get(name, "absent")
+        same = math.isclose(now, then) if isinstance(now, float) and isinstance(then, float) else now == then
+        if not same:
+            others.append(f"{name} = {now} (saved: {then})")
+    if others:
+        raise ValueError(f"{folder / SOLUTION}: another problem than was solved: {', '.join(others)}")
 
 
 def _combinations(disc: Discretisation) -> dict[int, Tensor]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import partial
 from typing import Any
 
 import pytest
@@ -11,7 +12,7 @@ from helpers import PROBLEMS, problem, random
 
 from ponn_torch.optimal_control.control_laws import Box, ThrustBall, Unconstrained
 from ponn_torch.optimal_control.pontryagin import pontryagin
-from ponn_torch.optimal_control.problem import FreeTime, OptimalControlProblem
+from ponn_torch.optimal_control.problem import DisplayUnit, FreeTime, OptimalControlProblem
 
 
 def statement(**changes: Any) -> dict[str, Any]:
@@ -36,6 +37,10 @@ def bounded(minimum: str) -> dict[str, Any]:
     return {"control": Box("force", 1.0, minimum, size=2), "parameters": {"strength": -1.0}}
 
 
+def one_argument(t: torch.Tensor) -> dict[str, torch.Tensor]:
+    return {"position": t, "velocity": t}
+
+
 SLIPS: list[tuple[dict[str, Any], str]] = [
     ({"initial": {"positoin": 0.0}}, "initial names 'positoin'; .*did you mean 'position'"),
     ({"final": {"velocitty": 0.0}}, "final names 'velocitty'; .*did you mean 'velocity'"),
@@ -54,6 +59,10 @@ SLIPS: list[tuple[dict[str, Any], str]] = [
     ({"initial": {"position": ("0", 0.0)}}, r"initial\['position'\] = \('0', 0.0\); finite numbers"),
     ({"initial": {"position": torch.zeros(2)}}, r"initial\['position'\] = tensor.*; finite numbers"),
     ({"parameters": {"weight": "1"}}, r"parameters\['weight'\] = '1'; a finite number"),
+    ({"display": {"q": 1}}, "display names 'q'; allowed: position, velocity, force, time, cost, origin"),
+    ({"display": {"forse": DisplayUnit("N")}}, r"display names 'forse'; .*did you mean 'force'"),
+    ({"display": {"position": 1e3}}, r"display\['position'\] = 1000.0; allowed: DisplayUnit\(label, size\)"),
+    ({"display": {"time": ("d", 86400.0)}}, r"display\['time'\] = \('d', 86400.0\); allowed: DisplayUnit\(label"),
     (bounded("-1"), "minimum of the control = '-1'; allowed: a number, strength"),
     (bounded("strenth"), "minimum of the control = 'strenth'; .*did you mean 'strength'"),
     ({"running_cost": lambda t, x, u, p: 1.0}, r"running_cost returns shape \(\); \(..., 1\)"),
@@ -64,6 +73,12 @@ SLIPS: list[tuple[dict[str, Any], str]] = [
     (rates(velocity=torch.zeros(5, 3)), r"dynamics\['velocity'\] has shape \(5, 3\); \(..., 2\) is needed"),
     ({"running_cost": lambda t, x, u, p: u.force**2}, r"running_cost returns shape \(5, 2\); \(..., 1\)"),
     ({"running_cost": lambda t, x, u, p: (u.force**2).sum(-1)}, r"running_cost returns shape \(5,\)"),
+    ({"terminal_cost": lambda x, p: x.position}, r"terminal_cost takes \(x, p\); terminal_cost\(t, x, p\) is expected"),
+    ({"terminal_manifold": lambda t, x, u, p: x.position}, r"takes \(t, x, u, p\); terminal_manifold\(t, x, p\) is"),
+    ({"running_cost": lambda t, x, u, p, *, k: t}, r"takes \(t, x, u, p, \*, k\); running_cost\(t, x, u, p\) is"),
+    ({"dynamics": one_argument}, r"dynamics takes \(t\); dynamics\(t, x, u, p\) is expected"),
+    ({"dynamics": None}, r"dynamics = None; a function dynamics\(t, x, u, p\) is expected"),
+    ({"terminal_cost": 1.0}, r"terminal_cost = 1.0; a function terminal_cost\(t, x, p\) is expected"),
     ({"terminal_cost": lambda t, x, p: x.position}, r"terminal_cost returns shape \(5, 2\); \(..., 1\)"),
 ]
 
@@ -72,6 +87,45 @@ SLIPS: list[tuple[dict[str, Any], str]] = [
 def test_slips_are_named_when_the_problem_is_stated(changes, message):
     OptimalControlProblem(**statement())
     with pytest.raises(ValueError, match=f"push: .*{message}"):
+        OptimalControlProblem(**statement(**changes))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ((1e3,), "label = 1000.0; a text"),
+        (("km", "1e3"), "size = '1e3'; a positive number"),
+        (("km", 0.0), "size = 0.0; a positive"),
+    ],
+)
+def test_a_unit_for_people_is_a_text_and_a_size(arguments, message):
+    with pytest.raises(ValueError, match=f"DisplayUnit: {message}"):
+        DisplayUnit(*arguments)
+
+
+def test_all_that_people_see_may_have_a_unit():
+    names = ("position", "velocity", "force", "force_magnitude", "time", "cost", "origin")
+    control = ThrustBall("force", 1.0, size=2)
+    display = {name: DisplayUnit("u", 10.0) for name in names}
+    made = OptimalControlProblem(
+        **statement(control=control, running_cost=lambda t, x, u, p: u.force_magnitude, display=display)
+    )
+    assert list(made.display) == list(names)
+
+
+def test_functions_may_be_of_any_kind_that_takes_the_arguments():
+    def energy(t, x, u, p, weight=0.5):
+        return weight * (u.force**2).sum(-1, keepdim=True)
+
+    class Terminal:
+        def __call__(self, *arguments):
+            return arguments[1].position[..., :1]
+
+    for changes in (
+        {"running_cost": energy},
+        {"running_cost": partial(energy, weight=2.0)},
+        {"terminal_cost": Terminal()},
+    ):
         OptimalControlProblem(**statement(**changes))
 
 

@@ -3,6 +3,8 @@
 import csv
 import json
 import math
+from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
@@ -10,8 +12,8 @@ from tensorboard.plugins.hparams import plugin_data_pb2
 
 from ponn_torch.cli import main as ponn
 from ponn_torch.cli.compare import main
-from ponn_torch.reporting.compare import compare, spread
-from ponn_torch.reporting.members import extremals, read_members
+from ponn_torch.reporting.compare import compare, spread, write_comparison
+from ponn_torch.reporting.members import Member, extremals, read_members
 from ponn_torch.reporting.overlays import histories_figure, solutions_figure
 from ponn_torch.reporting.reference import Reference
 from ponn_torch.solving import run as run_module
@@ -154,6 +156,34 @@ def test_extremals_are_told_apart_by_cost_and_costates(sweep):
     assert len(set(strict.values())) > 1
     cheapest = min(members, key=lambda member: member.cost)
     assert strict[cheapest.folder] == "A"
+
+
+def member(name, cost, smoothing):
+    """As much of one as letters need."""
+    return SimpleNamespace(folder=Path(name), solved=True, cost=cost, smoothing=smoothing, solution=None)
+
+
+def test_extremals_of_different_smoothing_are_those_of_different_problems():
+    sharp, other, smooth, exact = members = [
+        member("sharp", 268.04, 0.03), member("other", 300.0, 0.03), member("smooth", 272.2, 1.0),
+        member("exact", 268.01, 0.0),
+    ]  # fmt: skip
+    assert extremals(members) == {
+        exact.folder: "A", sharp.folder: "A (ρ 0.03)", other.folder: "B (ρ 0.03)", smooth.folder: "A (ρ 1)"
+    }  # fmt: skip
+    assert extremals([sharp, other]) == {sharp.folder: "A", other.folder: "B"}
+
+
+def test_smoothing_is_shown_where_there_is_any(sweep, tmp_path, monkeypatch):
+    folder, _ = sweep
+    smoothed = compare(folder)
+    assert [row["smoothing ρ"] for row in smoothed[0].rows()] == ["1", "1", "–"]  # the last one has no solution
+    assert [row["smoothing ρ"] for row in smoothed[0].member_rows()][:2] == [1.0, 1.0]
+    assert "Every ρ makes a problem of its own" in write_comparison(smoothed, tmp_path, {})
+    monkeypatch.setattr(Member, "smoothing", 0.0)
+    exact = compare(folder)
+    assert "smoothing ρ" not in exact[0].rows()[0]
+    assert "ρ" not in write_comparison(exact, tmp_path, {})
 
 
 @pytest.mark.parametrize(

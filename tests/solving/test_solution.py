@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import re
 import subprocess
 import sys
 from dataclasses import replace
@@ -20,7 +21,7 @@ from ponn_torch.ansatz.networks import MLP, FrozenMLP
 from ponn_torch.ansatz.switch_neurons import SwitchNeuronBasis
 from ponn_torch.optimal_control.control_set import Regime
 from ponn_torch.optimal_control.curve import Curve
-from ponn_torch.optimal_control.problem import ProblemOrigin
+from ponn_torch.optimal_control.problem import FreeTime, ProblemOrigin
 from ponn_torch.optimal_control.references import load_problem
 from ponn_torch.optimal_control.regularisers import REGULARISERS, make_regulariser
 from ponn_torch.solving.guess import project
@@ -232,7 +233,6 @@ def test_a_problem_without_origin_has_to_be_passed(tmp_path):
 OTHERS = {
     "states": {"units": {"x": 2.0, "v": 1.0}},
     "rates": {"dynamics": lambda t, x, u, p: {"x": x.v, "v": u.u - 1e-6 * x.x}},
-    "boundary": {"final": {"x": 1.0, "v": 1e-6}},
 }
 
 
@@ -241,6 +241,37 @@ def test_another_problem_of_the_same_name_is_noticed(what, tmp_path):
     solve(minimum_energy(), REST).save(tmp_path)
     with pytest.raises(ValueError, match=f"the rebuilt {what} is not the saved one"):
         Solution.load(tmp_path, replace(minimum_energy(), **OTHERS[what]))
+
+
+@pytest.mark.parametrize(
+    ("changes", "told"),
+    [
+        ({"final": {"x": 1.0, "v": 1e-6}}, "final v = 1e-06 (saved: 0.0)"),
+        ({"final": {"x": 1.0}}, "final v = free (saved: 0.0)"),
+        ({"final_time": 2.0}, "final_time = 2.0 (saved: 1.0)"),
+        ({"final_time": FreeTime(1.0)}, "final_time = free (saved: 1.0)"),
+        ({"parameters": {"mass": 2.0}}, "parameters['mass'] = 2.0 (saved: 1.0)"),
+        ({"parameters": {}}, "parameters['mass'] = absent (saved: 1.0)"),
+        ({"initial": {"x": 1, "v": 0}, "final_time": 2}, "initial x = 1.0 (saved: 0.0), final_time = 2.0 (saved: 1.0)"),
+    ],
+)
+def test_what_is_stated_otherwise_is_named(changes, told, tmp_path):
+    problem = replace(minimum_energy(), parameters={"mass": 1.0})
+    solve(problem, REST).save(tmp_path)
+    assert Solution.load(tmp_path, problem).problem is problem
+    with pytest.raises(ValueError, match=re.escape(f"another problem than was solved: {told}") + "$"):
+        Solution.load(tmp_path, replace(problem, **changes))
+
+
+def test_other_ends_are_noticed_where_what_was_stated_is_not_saved(tmp_path):
+    solve(minimum_energy(), REST).save(tmp_path)
+    path = tmp_path / "solution.json"
+    description = json.loads(path.read_text(encoding="utf-8"))
+    del description["problem"]["stated"]
+    path.write_text(json.dumps(description), encoding="utf-8")
+    assert Solution.load(tmp_path, minimum_energy()).problem.name == "minimum_energy"
+    with pytest.raises(ValueError, match="the rebuilt boundary is not the saved one"):
+        Solution.load(tmp_path, replace(minimum_energy(), final={"x": 1.0, "v": 1e-6}))
 
 
 def test_a_problem_of_another_name_is_noticed(tmp_path):
