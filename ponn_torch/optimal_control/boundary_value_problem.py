@@ -20,7 +20,7 @@ from ponn_torch.numerics.autodiff import differentiable, gradients_and_values, p
 from ponn_torch.optimal_control.control_set import ControlSet, Minimiser, Regime
 from ponn_torch.optimal_control.meaning import meaning
 from ponn_torch.optimal_control.problem import Named, OptimalControlProblem
-from ponn_torch.optimal_control.singular import singular_control
+from ponn_torch.optimal_control.singular import singular_fractions
 
 
 @dataclass(frozen=True)
@@ -167,7 +167,7 @@ class BoundaryValueProblem:
         regime = setting.regime
         with differentiable(t, w, *setting.parameters.values()):
             if self.singular and regime.arcs is not None and regime.interior is None:
-                regime = replace(regime, interior=singular_control(self, t, w, setting).fraction)
+                regime = replace(regime, interior=singular_fractions(self, t, w, setting))
             return self.law.minimise(h, p, w[..., :1], regime)
 
     def rates(self, t: Tensor, w: Tensor, setting: Setting) -> Tensor:

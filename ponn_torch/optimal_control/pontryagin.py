@@ -203,6 +203,10 @@ def probe_settings(bvp: BoundaryValueProblem, t: Tensor) -> list[Setting]:
     if bvp.law.n_switching:
         one = torch.ones(*t.shape[:-1], bvp.law.n_bounded, dtype=torch.long, device=t.device)
         regimes += [Regime(arcs=code * one) for code in (LOWER, INTERIOR, UPPER)]
+        for component in bvp.singular:
+            only = LOWER * one
+            only[..., component] = INTERIOR
+            regimes.append(Regime(arcs=only))
     return [Setting(regime, parameters) for regime in regimes]
 
 

@@ -8,7 +8,6 @@ right.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 
 import torch
 from torch import Tensor
@@ -39,17 +38,6 @@ def graded_times(curve: Curve, smoothing: float, n_segments: int) -> Tensor:
     return torch.cat([t[:1], inner, t[-1:]])
 
 
-def undecided(curve: Curve, smoothing: float) -> tuple[float, float]:
-    """The longest interval of scaled time over which some |S| ≤ ρ; (0, 0) if there is none."""
-    t, w = grid(curve, max(50, 2000 // curve.collocation.n_segments))
-    longest = (0.0, 0.0)
-    for inside in (switching_along(curve, t, w).abs() <= smoothing).unbind(-1):
-        edges = torch.cat([inside.new_zeros(1), inside, inside.new_zeros(1)]).long().diff()
-        for first, after in zip((edges == 1).nonzero(), (edges == -1).nonzero(), strict=True):
-            longest = max(longest, (float(t[first]), float(t[after - 1])), key=lambda ends: ends[1] - ends[0])
-    return longest
-
-
 def legible(curve: Curve, blunter: Curve) -> bool:
     """Whether S shows the arcs that it has without smoothing: those that it is extrapolated to from a blunter curve.
 
@@ -78,17 +66,3 @@ def _turns(switching: Tensor) -> Tensor:
     """Where S (m, k) has a local extremum or an end."""
     slope, ends = switching.diff(dim=0), switching.new_ones(1, switching.shape[1])
     return torch.cat([ends, -slope[1:] * slope[:-1], ends]) >= 0
-
-
-def singular_interval(rungs: Sequence[tuple[float, tuple[float, float]]]) -> tuple[float, float] | None:
-    """Where S vanishes in the limit, from pairs of ρ, descending, and the interval over which |S| ≤ ρ; None if nowhere.
-
-    About a switch that interval shrinks as ρ, where S touches zero as √ρ; on a singular arc it stays.
-    """
-    if not rungs:
-        return None
-    smoothing, (start, end) = rungs[-1]
-    before = [ends for value, ends in rungs if value >= 8 * smoothing]
-    if not before or end - start < 0.6 * (before[-1][1] - before[-1][0]):
-        return None
-    return (start, end) if end > start else None

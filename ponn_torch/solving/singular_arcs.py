@@ -7,15 +7,17 @@ split passes a switch the other way, so that it is on the wrong side before and 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from ponn_torch.optimal_control.boundary_value_problem import Setting
-from ponn_torch.optimal_control.control_set import INTERIOR, Regime
+from ponn_torch.optimal_control.control_set import INTERIOR, LOWER, UPPER, Regime
 from ponn_torch.optimal_control.curve import Curve
 from ponn_torch.optimal_control.pontryagin import with_singular_arcs
-from ponn_torch.optimal_control.singular import singular_components, singular_control
+from ponn_torch.optimal_control.singular import clebsch, singular_components, singular_fractions
 from ponn_torch.solving.switching import (
     Structure,
     claimed_structure,
@@ -25,12 +27,62 @@ from ponn_torch.solving.switching import (
     switching_along,
 )
 
+ROUNDING = 1e-9  # of the terms of S̈, below which it does not depend on the control
+NEARLY = 0.05  # of a control's range, by which it may leave that between two points
 
-def with_singular_arc(structure: Structure, ends: Tensor, component: int, start: float, end: float) -> Structure:
-    """The same arcs, with a component of the control inside its bounds from ``start`` to ``end``, where its S vanishes.
+
+class Stretch(NamedTuple):
+    """Scaled times between which S of a component cannot be told from zero."""
+
+    component: int
+    start: float
+    end: float
+
+    @property
+    def length(self) -> float:
+        return self.end - self.start
+
+
+def undecided(curve: Curve, smoothing: float) -> Stretch:
+    """The longest stretch over which some |S| ≤ ρ; one without length if there is none."""
+    t, w = grid(curve, max(50, 2000 // curve.collocation.n_segments))
+    longest = Stretch(0, 0.0, 0.0)
+    for component, inside in enumerate((switching_along(curve, t, w).abs() <= smoothing).unbind(-1)):
+        for first, last in _runs(inside):
+            longest = max(longest, Stretch(component, float(t[first]), float(t[last])), key=lambda one: one.length)
+    return longest
+
+
+def vanishing(rungs: Sequence[tuple[float, Stretch]]) -> Stretch | None:
+    """Where S vanishes in the limit, from pairs of ρ, descending, and the stretch over which |S| ≤ ρ; None if nowhere.
+
+    About a switch that stretch shrinks as ρ, where S touches zero as √ρ; on a singular arc it stays.
+    """
+    if not rungs:
+        return None
+    smoothing, last = rungs[-1]
+    before = [stretch for value, stretch in rungs if value >= 8 * smoothing]
+    if not before or last.component != before[-1].component or last.length < 0.6 * before[-1].length:
+        return None
+    return last if last.length > 0 else None
+
+
+def _runs(inside: Tensor) -> list[tuple[int, int]]:
+    """First and last index of every run of true entries."""
+    edges = torch.cat([inside.new_zeros(1), inside, inside.new_zeros(1)]).long().diff()
+    firsts, afters = (edges == 1).nonzero()[:, 0], (edges == -1).nonzero()[:, 0]
+    return list(zip(firsts.tolist(), (afters - 1).tolist(), strict=True))
+
+
+# -- structures ----------------------------------------------------------------------------------------------------
+
+
+def with_arc(structure: Structure, ends: Tensor, stretch: Stretch, code: int) -> Structure:
+    """The same arcs, but that of one component is another on a stretch, and its S vanishes where that begins and ends.
 
     ``ends`` are the scaled times at which the whole begins and ends.
     """
+    component, start, end = stretch
     inside = (structure.times >= start) & (structure.times <= end)
     switches = [
         (time, tuple(e for e in events if not (gone and e == component)))
@@ -42,17 +94,13 @@ def with_singular_arc(structure: Structure, ends: Tensor, component: int, start:
     knots = torch.cat([ends[:1], times, ends[-1:]])
     middle = 0.5 * (knots[1:] + knots[:-1])
     arcs = structure.arcs[torch.searchsorted(structure.times, middle)]
-    singular = (middle > start) & (middle < end)
-    arcs[:, component] = torch.where(singular, INTERIOR, arcs[:, component])
+    arcs[:, component] = torch.where((middle > start) & (middle < end), code, arcs[:, component])
     return Structure(arcs, times, tuple(events for _, events in switches))
 
 
-def on_interval(curve: Curve, interval: tuple[float, float]) -> Structure:
-    """The arcs that S of a smoothed curve asks for, with a singular one of the component whose S is zero there."""
-    t, w = grid(curve)
-    within = (t >= interval[0]) & (t <= interval[1])
-    component = int(switching_along(curve, t[within], w[within]).abs().amax(0).argmin())
-    return with_singular_arc(find_structure(curve), curve.times, component, *interval)
+def on_stretch(curve: Curve, stretch: Stretch) -> Structure:
+    """The arcs that S of a smoothed curve asks for, with a singular one where S is zero."""
+    return with_arc(find_structure(curve), curve.times, stretch, INTERIOR)
 
 
 def at_turned_switches(curve: Curve, tolerance: float) -> Structure | None:
@@ -71,37 +119,83 @@ def at_turned_switches(curve: Curve, tolerance: float) -> Structure | None:
             wrong = (depth[:, event] > tolerance).long()
             left, right = int(wrong[:before].flip(0).cumprod(0).sum()), int(wrong[after:].cumprod(0).sum())
             if left and right:
-                start, end = float(t[before - left]), float(t[after + right - 1])
-                found = with_singular_arc(found, curve.times, event, start, end)
+                turned = Stretch(event, float(t[before - left]), float(t[after + right - 1]))
+                found = with_arc(found, curve.times, turned, INTERIOR)
     return found if found is not claimed and _plausible(curve, found) else None
 
 
 def _plausible(curve: Curve, structure: Structure) -> bool:
     """Whether in the middle of every singular arc the control would be inside its bounds, with Legendre and Clebsch."""
     knots = torch.cat([curve.times[:1], structure.times, curve.times[-1:]])
-    return _violation(curve, 0.5 * (knots[1:] + knots[:-1]), structure.arcs) == 0.0
+    middle = 0.5 * (knots[1:] + knots[:-1])
+    fractions, admissible = _on_arcs(curve, middle, curve(middle), structure.arcs)
+    return admissible and bool((_outside(fractions, structure.arcs) <= 0).all())
+
+
+def at_bounds(curve: Curve, tolerance: float) -> Structure | None:
+    """The arcs of a split ``curve``, at a bound where the control of a singular arc would leave it; None if nowhere."""
+    found = claimed = claimed_structure(curve)
+    if not curve.collocation.bvp.singular:
+        return None
+    t, arc, _ = depth_along(curve, claimed)
+    codes = claimed.arcs[arc]
+    fractions, _ = _on_arcs(curve, t, curve(t), codes)
+    for component in curve.collocation.bvp.singular:
+        eta, on = fractions[:, component], codes[:, component] == INTERIOR
+        for code, past in ((LOWER, -eta), (UPPER, eta - 1.0)):
+            for first, last in _runs(on & (past > tolerance)):
+                if last > first:
+                    stretch = Stretch(component, float(t[first]), float(t[last]))
+                    found = with_arc(found, curve.times, stretch, code)
+    return None if found is claimed else found
+
+
+# -- admissible arcs -------------------------------------------------------------------------------------------------
 
 
 def violation(curve: Curve, n_points: int = 201) -> float:
-    """How far the control leaves its range on singular arcs, in ranges; infinite where Legendre and Clebsch's b ≤ 0."""
+    """How far the control leaves its range on singular arcs, in ranges; infinite without Legendre and Clebsch.
+
+    Looked at more closely where it comes near a bound between the points, as its peak may lie there.
+    """
     arcs = curve.collocation.setting.regime.arcs
     if not singular_components(curve.collocation.bvp.law, arcs):
         return 0.0
     assert arcs is not None
     z = torch.linspace(-1.0, 1.0, n_points, dtype=curve.xi.dtype, device=curve.xi.device)
-    t, _, _, segment = curve.on_segments(z)
-    return _violation(curve, t, arcs[segment])
+    t, w, _, segment = curve.on_segments(z)
+    fine, worst = torch.linspace(0.0, 1.0, 21, dtype=t.dtype, device=t.device), 0.0
+    for _ in range(3):
+        fractions, admissible = _on_arcs(curve, t, w, arcs[segment])
+        if not admissible:
+            return math.inf
+        past = _outside(fractions, arcs[segment]).amax(-1)
+        worst = max(worst, float(past.nan_to_num(math.inf).max()))
+        same = segment[2:] == segment[:-2]
+        peak = same & (past[1:-1] >= past[:-2]) & (past[1:-1] >= past[2:]) & (past[1:-1] > -NEARLY)
+        at = peak.nonzero()[:, 0] + 1
+        if not len(at):
+            break
+        left, right = t[at - 1], t[at + 1]
+        t, segment = (
+            (left[:, None] + (right - left)[:, None] * fine).flatten(),
+            segment[at].repeat_interleave(len(fine)),
+        )
+        w = curve.at(t, segment)
+    return max(worst, 0.0)
 
 
-def _violation(curve: Curve, t: Tensor, arcs: Tensor) -> float:
-    """The same at scaled times (m,) for arc codes (m, k)."""
+def _outside(fractions: Tensor, arcs: Tensor) -> Tensor:
+    """How far η (m, k) is past its range, negative inside it; −1 where no arc is singular."""
+    return torch.where(arcs == INTERIOR, torch.maximum(-fractions, fractions - 1.0), -1.0)
+
+
+def _on_arcs(curve: Curve, t: Tensor, w: Tensor, arcs: Tensor) -> tuple[Tensor, bool]:
+    """η (m, k) at scaled times (m,) for arc codes (m, k), and whether Legendre and Clebsch's condition holds."""
     bvp = curve.collocation.bvp
-    components = singular_components(bvp.law, arcs)
+    bvp = with_singular_arcs(bvp, singular_components(bvp.law, arcs))
     parameters = curve.setting(torch.zeros_like(t, dtype=torch.long)).parameters
     setting = Setting(Regime(arcs=arcs), parameters)
-    fraction, bend = singular_control(with_singular_arcs(bvp, components), t[:, None], curve(t), setting)
-    on = arcs == INTERIOR
-    if not bool((bend[on] > 0).all()):
-        return math.inf
-    outside = torch.maximum(-fraction, fraction - 1.0)[on]
-    return float(outside.clamp_min(0.0).nan_to_num(math.inf).max())
+    with torch.no_grad():
+        fractions = singular_fractions(bvp, t[:, None], w, setting)
+        return fractions, bool((clebsch(bvp, t[:, None], w, setting) > ROUNDING).all())

@@ -36,7 +36,7 @@ from ponn_torch.solving.refinement import (
     Segments,
     shared_out,
 )
-from ponn_torch.solving.sharpening import graded_times, singular_interval, undecided
+from ponn_torch.solving.sharpening import graded_times
 from ponn_torch.solving.switching import (
     Structure,
     claimed_structure,
@@ -110,7 +110,7 @@ class Split(Segmentation, Refinement):
     def _searched(self, search: _Search, start: Curve, blunter: Curve | None) -> Refined:
         rounds = search.rounds.results
         read: list[tuple[Structure, int]] = []
-        rungs: list[tuple[float, tuple[float, float]]] = []
+        rungs: list[tuple[float, singular_arcs.Stretch]] = []
         refined, singular = Refined(start, Outcome.STRUCTURE, rounds), None
         for smoothed, n_segments in self._starts(search, start):
             if rounds and rounds[-1].status.cut:
@@ -118,14 +118,14 @@ class Split(Segmentation, Refinement):
             claimed = smoothed.collocation.setting.regime.arcs is not None
             structures = [claimed_structure(smoothed) if claimed else find_structure(smoothed, polish=0)]
             if smoothed.smoothing:
-                rungs.append((smoothed.smoothing, undecided(smoothed, smoothed.smoothing)))
-                singular = singular_interval(rungs)
+                rungs.append((smoothed.smoothing, singular_arcs.undecided(smoothed, smoothed.smoothing)))
+                singular = singular_arcs.vanishing(rungs)
                 if blunter is not None:
                     guessed = find_structure(smoothed, blunter)
                     # of the same arcs the curve's own times fit it better
                     structures = structures if guessed.same_arcs(structures[0]) else [guessed, *structures]
                 if singular is not None:
-                    structures.append(singular_arcs.on_interval(smoothed, singular))
+                    structures.append(singular_arcs.on_stretch(smoothed, singular))
             blunter = smoothed
             moved = MOVED * float(smoothed.times[-1])
             for structure in structures:
@@ -138,7 +138,7 @@ class Split(Segmentation, Refinement):
         if singular is None:
             return refined
         unit = start.collocation.bvp.problem.display.get("time", DisplayUnit("s"))
-        ends = [f"{time * start.collocation.bvp.time_unit / unit.size:.4g}" for time in singular]
+        ends = [f"{t * start.collocation.bvp.time_unit / unit.size:.4g}" for t in (singular.start, singular.end)]
         return Refined(smoothed, Outcome.SINGULAR, rounds, f": from {ends[0]} to {ends[1]} {unit.label}")
 
     def _starts(self, search: _Search, start: Curve) -> Iterator[tuple[Curve, int]]:
@@ -221,7 +221,8 @@ class Split(Segmentation, Refinement):
     def _repairs(self, curve: Curve, solved: bool) -> list[Structure]:
         """Other structures to try, the best first: without the arcs that are gone, or where S asks, with others.
 
-        These are singular arcs where S turns round at a switch, or one needle more.
+        These are singular arcs where S turns round at a switch, bounds where their control would leave them, or one
+        needle more.
         """
         found = claimed_structure(curve)
         ends = torch.cat([curve.times[:1], found.times, curve.times[-1:]])
@@ -231,7 +232,8 @@ class Split(Segmentation, Refinement):
         if not solved:
             return []
         regular = needles(curve, self.needle, self.sign_tolerance)
-        singular = singular_arcs.at_turned_switches(curve, self.sign_tolerance) if regular else None
+        repair = singular_arcs.at_turned_switches if regular else singular_arcs.at_bounds
+        singular = repair(curve, self.sign_tolerance)
         return regular if singular is None else [singular, *regular]
 
 

@@ -189,7 +189,8 @@ def needles(curve: Curve, width: float, tolerance: float) -> list[Structure]:
             length = min(width * float(ends[-1] - ends[0]), 0.3 * float(ends[k + 1] - ends[k]))
             middle = float(t[peak].clamp(ends[k] + length, ends[k + 1] - length))
             new = [middle - 0.5 * length, middle + 0.5 * length]
-            needle = _other_side(arcs[k], event, depth.shape[-1])
+            above = bool(switching_along(curve, t[peak : peak + 1])[0, event] > 0)
+            needle = _other_side(arcs[k], event, depth.shape[-1], above)
             pieces = [arcs[: k + 1], needle[None], arcs[k:]]
             if int(points[-1]) == len(run) - 1:
                 new, pieces = [float(ends[-1]) - length], pieces[:2]
@@ -201,11 +202,11 @@ def needles(curve: Curve, width: float, tolerance: float) -> list[Structure]:
     return [structure for _, structure in sorted(found, key=lambda pair: -pair[0])]
 
 
-def _other_side(codes: Tensor, event: int, n_switching: int) -> Tensor:
-    """Arc codes (k,) with the component of one switching function moved to that function's other side."""
+def _other_side(codes: Tensor, event: int, n_switching: int, above: bool) -> Tensor:
+    """Arc codes (k,) with the component of one switching function moved to the side where that is, ``above`` zero."""
     levels = (LOWER, UPPER) if n_switching == len(codes) else (LOWER, INTERIOR, UPPER)
     component, level = event % len(codes), event // len(codes)
     low, high = levels[level], levels[level + 1]
     changed = codes.clone()
-    changed[component] = low if int(codes[component]) >= high else high
+    changed[component] = high if above else low
     return changed

@@ -15,7 +15,7 @@ from ponn_torch.optimal_control.control_laws import Box, ThrustBall
 from ponn_torch.optimal_control.control_set import INTERIOR, LOWER, UPPER, Regime
 from ponn_torch.optimal_control.pontryagin import pontryagin, with_singular_arcs
 from ponn_torch.optimal_control.problem import OptimalControlProblem
-from ponn_torch.optimal_control.singular import singular_components, singular_control
+from ponn_torch.optimal_control.singular import clebsch, singular_components, singular_fractions
 
 
 def cheap() -> OptimalControlProblem:
@@ -72,21 +72,38 @@ def test_s_differentiated_twice_along_its_own_flow_vanishes(name):
     t, w = points(bvp)
     codes = torch.full((20, plain.law.n_bounded), LOWER)
     codes[:, component] = INTERIOR
-    fraction, bend = singular_control(bvp, t, w, on_arcs(bvp, codes))
-    held = on_arcs(bvp, codes, interior=fraction)
+    fraction = singular_fractions(bvp, t, w, on_arcs(bvp, codes))
     near = fraction[:, component].abs() < 5.0  # controls far out of their range make flows that steps do not follow
     assert int(near.sum()) > 10
     step = 1e-3 * plain.final_time
 
-    def switching(ahead: float) -> Tensor:
-        there = runge_kutta(lambda passed, y: plain.rates(t + passed, y, held), w, ahead)
-        return plain.switching(t + ahead, there, Setting())[:, component]
+    def curvature(held: Tensor) -> Tensor:
+        setting = on_arcs(bvp, codes, interior=held)
 
-    def bend_of(h: float) -> Tensor:
-        return (switching(h) - 2 * switching(0.0) + switching(-h)) / h**2
+        def switching(ahead: float) -> Tensor:
+            there = runge_kutta(lambda passed, y: plain.rates(t + passed * ahead, y, setting), w, ahead)
+            return plain.switching(t + ahead, there, Setting())[:, component]
 
-    curvature = (4 * bend_of(step) - bend_of(2 * step)) / 3
-    assert float((curvature / bend[:, component])[near].abs().max()) < 1e-5
+        def bend_of(h: float) -> Tensor:
+            return (switching(h) - 2 * switching(0.0) + switching(-h)) / h**2
+
+        return (4 * bend_of(step) - bend_of(2 * step)) / 3
+
+    at_upper, at_lower = curvature(torch.ones_like(fraction)), curvature(torch.zeros_like(fraction))
+    assert float((curvature(fraction) / (at_upper - at_lower))[near].abs().max()) < 1e-5
+    sign = clebsch(bvp, t, w, on_arcs(bvp, codes))
+    assert bool(((sign > 0) == (at_upper > at_lower))[near].all())
+
+
+def test_opposed_controls_of_a_pair_do_not_hide_each_others_couplings():
+    """T⁺ and T⁻ both inside their bounds have slopes that cancel; what F depends on must be seen all the same."""
+    bvp = with_singular_arcs(bvp_of("free_flying_robot"), (0, 1, 2, 3))
+    t, w = points(bvp)
+    for component in range(4):
+        codes = torch.full((20, 4), LOWER)
+        codes[:, component] = INTERIOR
+        by_w = bvp.linearised_rates(t, w, on_arcs(bvp, codes), range(bvp.dimension))[2]
+        assert not bool(((by_w != 0).any(0) & ~bvp.couplings).any())
 
 
 def test_the_jacobian_sees_how_the_control_depends_on_states_and_costates():

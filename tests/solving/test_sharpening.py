@@ -17,7 +17,8 @@ from ponn_torch.optimal_control.curve import Curve
 from ponn_torch.optimal_control.pontryagin import pontryagin
 from ponn_torch.optimal_control.problem import OptimalControlProblem
 from ponn_torch.solving.guess import project
-from ponn_torch.solving.sharpening import graded_times, singular_interval, undecided
+from ponn_torch.solving.sharpening import graded_times
+from ponn_torch.solving.singular_arcs import Stretch, undecided, vanishing
 from ponn_torch.solving.switching import switching_along
 
 
@@ -79,17 +80,19 @@ def test_graded_segments_resolve_the_smoothed_control(smoothing):
 
 
 def test_the_undecided_interval_is_the_longest_with_s_below_the_smoothing():
-    start, end = undecided(with_switching(lambda t: (t - 1.0) * (t - 2.5) ** 2), 0.1)
+    component, start, end = undecided(with_switching(lambda t: (t - 1.0) * (t - 2.5) ** 2), 0.1)
+    assert component == 0
     inside = [t for t in np.linspace(2.0, 3.0, 100001) if abs((t - 1.0) * (t - 2.5) ** 2) <= 0.1]
     assert (start, end) == pytest.approx((inside[0], inside[-1]), abs=3e-3)
-    assert undecided(with_switching(lambda t: 1.0 + t), 0.1) == (0.0, 0.0)
+    assert undecided(with_switching(lambda t: 1.0 + t), 0.1).length == 0.0
 
 
 @pytest.mark.parametrize(("power", "singular"), [(1.0, False), (0.5, False), (0.0, True)])
 def test_an_interval_that_does_not_shrink_is_singular(power, singular):
     """Widths fall as ρ about a switch and as √ρ where S touches zero."""
-    rungs = [(rho, (1.0, 1.0 + 0.5 * rho**power)) for rho in (0.1, 0.05, 0.025, 0.0125, 0.00625)]
-    found = singular_interval(rungs)
+    rungs = [(rho, Stretch(0, 1.0, 1.0 + 0.5 * rho**power)) for rho in (0.1, 0.05, 0.025, 0.0125, 0.00625)]
+    found = vanishing(rungs)
     assert (found == rungs[-1][1]) if singular else (found is None)
-    assert singular_interval(rungs[:2]) is None  # too few to tell
-    assert singular_interval([]) is None
+    assert vanishing(rungs[:2]) is None  # too few to tell
+    assert vanishing([]) is None
+    assert vanishing([*rungs[:-1], (0.00625, rungs[-1][1]._replace(component=1))]) is None

@@ -3,23 +3,33 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from functools import cache
 
 import pytest
 import torch
 from analytic import solve
 from helpers import problem
+from torch import Tensor
 
+from ponn_torch.ansatz.basis import Chebyshev
+from ponn_torch.numerics.nodes import make_nodes
+from ponn_torch.optimal_control.boundary_value_problem import Setting
+from ponn_torch.optimal_control.collocation import Collocation
 from ponn_torch.optimal_control.control_laws import Box
-from ponn_torch.optimal_control.control_set import INTERIOR, LOWER, UPPER
+from ponn_torch.optimal_control.control_set import INTERIOR, LOWER, UPPER, Regime
+from ponn_torch.optimal_control.curve import Curve
+from ponn_torch.optimal_control.discretisation import Discretisation
+from ponn_torch.optimal_control.pontryagin import pontryagin, with_singular_arcs
 from ponn_torch.optimal_control.problem import OptimalControlProblem
 from ponn_torch.solving.certificate import certify
+from ponn_torch.solving.guess import project
 from ponn_torch.solving.result import SolveResult
-from ponn_torch.solving.singular_arcs import violation, with_singular_arc
+from ponn_torch.solving.singular_arcs import Stretch, violation, with_arc
 from ponn_torch.solving.solution import Solution
 from ponn_torch.solving.solver import Solver
 from ponn_torch.solving.split import Split
-from ponn_torch.solving.switching import Structure
+from ponn_torch.solving.switching import Structure, needles, switching_along
 
 BOTH_ENDS = torch.tensor([0.0, 4.0], dtype=torch.float64)
 
@@ -66,7 +76,7 @@ def structure(codes: list[list[int]], times: list[float], events: list[tuple[int
     ],
 )
 def test_an_arc_is_put_in(stretch, codes, times, events):
-    found = with_singular_arc(structure([[UPPER], [LOWER]], [1.0], [(0,)]), BOTH_ENDS, 0, *stretch)
+    found = with_arc(structure([[UPPER], [LOWER]], [1.0], [(0,)]), BOTH_ENDS, Stretch(0, *stretch), INTERIOR)
     assert found.arcs.flatten().tolist() == codes
     assert found.times.tolist() == times
     assert list(found.events) == events
@@ -74,12 +84,12 @@ def test_an_arc_is_put_in(stretch, codes, times, events):
 
 def test_switches_of_other_components_stay():
     given = structure([[UPPER, LOWER], [UPPER, UPPER], [LOWER, UPPER]], [1.0, 2.0], [(1,), (0,)])
-    found = with_singular_arc(given, BOTH_ENDS, 0, 0.5, 2.5)
+    found = with_arc(given, BOTH_ENDS, Stretch(0, 0.5, 2.5), INTERIOR)
     assert found.arcs.tolist() == [[UPPER, LOWER], [INTERIOR, LOWER], [INTERIOR, UPPER], [LOWER, UPPER]]
     assert found.times.tolist() == [0.5, 1.0, 2.5]
     assert found.events == ((0,), (1,), (0,))
     together = structure([[UPPER, LOWER], [LOWER, UPPER]], [1.0], [(0, 1)])
-    assert with_singular_arc(together, BOTH_ENDS, 0, 0.5, 2.5).events == ((0,), (1,), (0,))
+    assert with_arc(together, BOTH_ENDS, Stretch(0, 0.5, 2.5), INTERIOR).events == ((0,), (1,), (0,))
 
 
 @pytest.mark.parametrize(
@@ -123,6 +133,74 @@ def test_the_certificate_asks_for_a_control_inside_its_bounds():
     assert certificate.end_error_scaled < 1e-12
     assert not certificate.certified
     assert "singular violation" in certificate.verdict
+
+
+def tracking(path: Callable[[Tensor], Tensor], final_time: float, start: float) -> OptimalControlProblem:
+    """½∫(x − path)² dt with ẋ = u, |u| ≤ 1: on an arc u is the rate of the path, which depends on time."""
+    return OptimalControlProblem(
+        name="tracking",
+        states={"x": 1},
+        control=Box("u", 1.0, -1.0),
+        dynamics=lambda t, x, u, p: {"x": u.u},
+        running_cost=lambda t, x, u, p: 1.0 + 0.5 * (x.x - path(t)) ** 2,
+        initial={"x": start},
+        final={},
+        final_time=final_time,
+    )
+
+
+def test_a_path_that_is_too_steep_in_places_is_left_there():
+    """0.6 sin 2.5t: where its rate is above one the control is at its bound, and singular before and after."""
+    problem = tracking(lambda t: 0.6 * torch.sin(2.5 * t), 6.0, 0.3)
+    result = Solver(n_starts=2).solve(problem, 0)
+    assert result.certified, result.message
+    assert result.solution.arcs.count("singular") > 2
+    assert set(result.solution.arcs) == {"min", "singular", "max"}
+
+
+def test_a_bound_that_is_passed_between_two_points_is_seen():
+    """The rate of the path has a narrow peak, 1e-6 above one, between the points where the control is looked at."""
+    width, middle, excess = 0.1, 0.5025, 1e-6
+
+    def path(t: Tensor) -> Tensor:
+        shifted = torch.atan((t - middle) / width) + math.atan(middle / width)
+        return 0.5 * t + (0.5 + excess) * width * shifted
+
+    problem = tracking(path, 1.0, 0.0)
+    solution = solve(problem, [[0.0, 0.0], [0.7, 0.0]], arcs=[INTERIOR], basis=Chebyshev(150), n_nodes=200)
+    assert violation(solution.curve) == pytest.approx(excess / 2, rel=0.05)
+
+
+def test_two_components_at_once_have_to_be_convex_together():
+    """½x² + ½y² + 2xy: each alone satisfies Legendre and Clebsch, and along x = −y the cost falls."""
+    for coupling, measured in ((0.5, 0.0), (2.0, math.inf)):
+        problem = OptimalControlProblem(
+            name="pair",
+            states={"x": 1, "y": 1},
+            control=Box("u", 1.0, -1.0, size=2),
+            dynamics=lambda t, x, u, p: {"x": u.u[..., :1], "y": u.u[..., 1:]},
+            running_cost=lambda t, x, u, p, k=coupling: 0.5 * (x.x**2 + x.y**2) + k * x.x * x.y,
+            initial={"x": 0.0, "y": 0.0},
+            final={"x": 0.0, "y": 0.0},
+            final_time=3.0,
+        )
+        bvp = with_singular_arcs(pontryagin(problem), (0, 1))
+        codes = torch.full((1, 2), INTERIOR)
+        disc = Discretisation(bvp, Chebyshev(10), make_nodes("legendre_gauss", 20))
+        made = Collocation.on_segments(disc, torch.tensor([0.0, 3.0]).double(), setting=Setting(Regime(arcs=codes)))
+        curve = Curve(made, project(made, lambda t: torch.zeros(len(t), 4, dtype=torch.float64)))
+        assert violation(curve) == measured
+        assert certify(Solution(curve)).certified is (measured == 0.0)
+
+
+def test_a_needle_in_a_singular_arc_points_where_s_does():
+    for start, code in ((0.5, LOWER), (-0.5, UPPER)):
+        problem = regulator(start=start, x=start)
+        solution = solve(problem, [[start, 5 * start], [start, 2 * start]], arcs=[INTERIOR])
+        (found, *_) = needles(solution.curve, 0.01, 1e-10)
+        switching = switching_along(solution.curve, solution.curve.times.mean()[None])
+        assert bool((switching > 0) == (code == UPPER))
+        assert code in found.arcs.flatten().tolist()
 
 
 @cache
