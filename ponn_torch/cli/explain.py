@@ -13,7 +13,7 @@ from ponn_torch.optimal_control.problem import OptimalControlProblem
 from ponn_torch.reporting.style import number, unit
 from ponn_torch.solving.feasibility import check_control, check_final_time
 from ponn_torch.solving.guess import Alternating, Guess, RandomGuess, ScaledCurve
-from ponn_torch.solving.solution import Solution
+from ponn_torch.solving.solution import Solution, in_a_row
 from ponn_torch.solving.solver import Solver
 
 N_STARTS, N_SEGMENTS = 4, 100  # of the problems that ask what is feasible; of the direct mesh
@@ -62,5 +62,5 @@ def _witness(problem: OptimalControlProblem, solver: Solver, solution: Solution 
     if not answer.solved:
         return ["direct collocation finds no trajectory either"]
     cost = number(answer.cost, unit(problem, "cost"), ".8g")
-    arcs = f" with arcs {'-'.join(answer.arcs)}" if answer.arcs else ""
+    arcs = f" with arcs {in_a_row(answer.arcs)}" if answer.arcs else ""
     return [f"direct collocation finds a trajectory{arcs}, {problem.cost_name} {cost}"]

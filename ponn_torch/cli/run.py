@@ -27,7 +27,7 @@ from ponn_torch.settings import ConfigError, one_line, users_line
 from ponn_torch.solving.certificate import Certificate
 from ponn_torch.solving.journal import ForeignJournal, Journal
 from ponn_torch.solving.result import StageResult
-from ponn_torch.solving.solution import Solution
+from ponn_torch.solving.solution import Solution, in_a_row
 
 CHOICES = "choices.yaml"
 
@@ -259,7 +259,7 @@ def _found(outcome: Outcome, problem: OptimalControlProblem, *, smoothed: bool) 
     if outcome.switch_times:
         *before, last = outcome.switch_times
         times = [f"{time / clock.size:.9g}" for time in before] + [number(last, clock, ".9g")]
-        rows.append(("switches", f"{', '.join(times)} ({'-'.join(outcome.arcs)})"))
+        rows.append(("switches", f"{', '.join(times)} ({in_a_row(outcome.arcs)})"))
     return rows
 
 

@@ -25,6 +25,7 @@ from ponn_torch.cli.job import BUG, INTERRUPTED, OVERRIDES, Outcome
 from ponn_torch.cli.overrides import Application, Command, InputError, composed, config_folder
 from ponn_torch.reporting.members import OUTCOME, natural
 from ponn_torch.settings import ConfigError
+from ponn_torch.solving.solution import in_a_row
 
 
 @dataclass(frozen=True)
@@ -217,7 +218,7 @@ def _summary(folder: Path, members: list[tuple[Path, dict[str, Any]]]) -> str:
         cost = float(outcome["cost"]) if outcome["cost"] is not None else math.nan
         shown = f"{cost:>16.10g}" if math.isfinite(cost) else f"{'–':>16}"
         settings = " ".join(text for text in outcome["overrides"] if text not in shared) or "defaults"
-        told = " ".join(["certified", "-".join(outcome["arcs"])]).strip()
+        told = " ".join(["certified", in_a_row(outcome["arcs"])]).strip()
         told = told if outcome["certified"] else outcome["message"]
         lines.append(f"{place.name:{width}}{shown}  {outcome['cpu_seconds']:7.2f}  {settings}: {told}")
     failed = sum(outcome["exit_code"] != 0 for _, outcome in members)

@@ -16,7 +16,7 @@ from typing import Any
 
 from ponn_torch.solving import checks, singular_arcs
 from ponn_torch.solving.flight import control_history, fly_control, fly_extremal
-from ponn_torch.solving.solution import Solution
+from ponn_torch.solving.solution import Solution, in_a_row
 
 SINGULAR_SHARE = 0.05  # of an arc over which |S| cannot be told from zero
 KNOWN_COST_SLACK = 1e-6  # relative, above which an extremal is another than the known one
@@ -252,7 +252,7 @@ def _verdict(solution: Solution, faults: list[str], cost_error: float | None = N
     if faults:
         return "NOT certified: " + "; ".join(faults)
     smoothing = "" if solution.smoothing is None else f"{solution.smoothing:g}"
-    arcs = "-".join(solution.arcs)
+    arcs = in_a_row(solution.arcs)
     other, known = "", None if solution.kind == "smoothed" else solution.problem.known_cost
     if known is not None and cost_error is not None and cost_error > KNOWN_COST_SLACK * abs(known):
         # necessary conditions do not tell extremals apart, the cost does

@@ -55,6 +55,11 @@ class Samples:
         return len(self.t)
 
 
+def in_a_row(arcs: Sequence[str]) -> str:
+    """Arcs in one line: max-min-max, or max,min / min,min where each names several components."""
+    return (" / " if any("," in arc for arc in arcs) else "-").join(arcs)
+
+
 @dataclass(frozen=True, eq=False)
 class Solution:
     """One curve, with everything that follows from it; without a batch axis.

@@ -25,14 +25,14 @@ from ponn_torch.optimal_control.problem import FreeTime, ProblemOrigin
 from ponn_torch.optimal_control.references import load_problem
 from ponn_torch.optimal_control.regularisers import REGULARISERS, make_regulariser
 from ponn_torch.solving.guess import project
-from ponn_torch.solving.solution import Samples, Solution
+from ponn_torch.solving.solution import Samples, Solution, in_a_row
 
 ANALYTIC = Path(__file__).with_name("analytic.py")
 REST = [[0.0, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 0.0]]
 
 LOAD = """
 import sys, numpy as np
-from ponn_torch.solving.solution import Solution
+from ponn_torch.solving.solution import Solution, in_a_row
 for folder in sys.argv[1:]:
     s = Solution.load(folder).sample(50)
     np.savez(f"{folder}.npz", t=s.t, S=s.switching, H=s.hamiltonian,
@@ -379,3 +379,9 @@ def test_regularisers_have_names():
         assert type(problem.control.regulariser) is REGULARISERS[name]
     with pytest.raises(ValueError, match="did you mean 'entropy'"):
         make_regulariser("entropi")
+
+
+def test_arcs_of_several_components_are_told_apart_from_each_other():
+    assert in_a_row(["max", "min", "max"]) == "max-min-max"
+    assert in_a_row(["max,min", "min,min"]) == "max,min / min,min"
+    assert in_a_row([]) == ""
