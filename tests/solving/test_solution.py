@@ -32,7 +32,7 @@ REST = [[0.0, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 0.0]]
 
 LOAD = """
 import sys, numpy as np
-from ponn_torch.solving.solution import Solution, in_a_row
+from ponn_torch.solving.solution import Solution
 for folder in sys.argv[1:]:
     s = Solution.load(folder).sample(50)
     np.savez(f"{folder}.npz", t=s.t, S=s.switching, H=s.hamiltonian,
