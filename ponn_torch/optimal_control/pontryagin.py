@@ -63,7 +63,7 @@ def _statement(problem: OptimalControlProblem) -> Hashable:
     """All that the equations depend on but the values of parameters; of the ends and the final time, what is known."""
     known = [[value is not None for value in problem.boundary(end)] for end in ("initial", "final")]
     functions = (problem.dynamics, problem.running_cost, problem.terminal_cost, problem.terminal_manifold)
-    rest = (problem.states, problem.control, problem.mass, problem.exhaust_velocity, problem.free_final_time)
+    rest = (problem.states, problem.control, problem.mass, problem.free_final_time)
     units = (problem.units, problem.costate_units, list(problem.parameters))
     return meaning([*functions, *rest, *units, known], problem)
 

@@ -86,7 +86,7 @@ class OptimalControlProblem:
         terminal_cost: φ(t, x, p) → (..., 1), or None.
         terminal_manifold: ψ(t, x, p) → (..., k) that must vanish at the end, or None.
         parameters: named numbers that may be varied at run time (continuation, batches): ``p.name``.
-        mass: name of the state that a change of mass variable applies to, with ``exhaust_velocity`` in m/s.
+        mass: name of the state that a change of mass variable applies to.
         display: state, control, ``time`` or ``cost`` → unit for people; ``origin`` → name of the body there.
         known_cost: the optimum in SI where it is known, for reports.
         origin: the call that made the problem (``load_problem``). A changed copy has none, so that no saved
@@ -107,7 +107,6 @@ class OptimalControlProblem:
     costate_units: Mapping[str, float] = field(default_factory=dict)
     parameters: Mapping[str, float] = field(default_factory=dict)
     mass: str | None = None
-    exhaust_velocity: float | None = None
     cost_name: str = "cost"
     known_cost: float | None = None
     display: Mapping[str, DisplayUnit] = field(default_factory=dict)

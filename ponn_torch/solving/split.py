@@ -1,9 +1,10 @@
 """The split: switches found exactly, in one least squares with everything else.
 
 The domain is cut at the switches, and coefficients, knot values, switch times and a free final time are solved for
-together, with rows S(t_k) = 0 and the control at its bound inside every arc (no smoothing is left). Both papers name
-this as future work. The sign of S is then checked on a fine grid, and where the minimum principle asks for other arcs
-these are tried: a solved residual with the wrong arcs is an extremal of nothing.
+together, with rows S(t_k) = 0 and the control at its bound inside every arc, or at what keeps S at zero along a
+singular one (no smoothing is left). Both papers name this as future work. The sign of S is then checked on a fine grid,
+and where the minimum principle asks for other arcs these are tried: a solved residual with the wrong arcs is an
+extremal of nothing.
 """
 
 from __future__ import annotations
