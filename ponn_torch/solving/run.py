@@ -22,6 +22,10 @@ from ponn_torch.solving.stages import Interrupted, Stages
 from ponn_torch.solving.walk import Walk
 
 SAME = "the same smoothed solution as before"
+OVERFLOW = (
+    "the equations are finite along no guess, which has states of the order of their units: measure states from where "
+    "they begin (altitudes, not radii), or guess a path"
+)
 MOST_REPEATS = 3  # starts that lead there, after which others are taken to lead there too
 
 
@@ -90,6 +94,8 @@ class Run:
         if len(self.causes) > 1:
             tally = ", ".join(f"{count} × {cause}" for cause, count in Counter(self.causes).most_common())
             said.append(f"of {n_starts} starts: {tally}")
+        if self.stages.done and all(stage.status is Status.NON_FINITE for stage in self.stages.done):
+            said.append(OVERFLOW)
         said.append(self.stages.bvp.problem.scaling_hint())
         text = "; ".join(part for part in said if part)
         return text if not self.clock.spent or Status.BUDGET.value in text else f"{Status.BUDGET.value}: {text}"

@@ -98,6 +98,11 @@ class Solver:
             value = getattr(self, name)
             if value < 1:
                 raise ValueError(f"{name} = {value}; allowed: at least 1")
+        if not callable(getattr(type(self.guess), "curve", None)):
+            given = type(self.guess).__name__
+            raise ValueError(
+                f"guess = {given}; allowed: what has curve(bvp, seed); Restart(solution) begins with a solution"
+            )
         if not self._pieces or min(self._pieces) < 1:
             raise ValueError(f"n_segments = {self.n_segments}; allowed: at least 1, or a list of such numbers")
         if not self.warm_damping >= 0:

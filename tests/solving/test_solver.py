@@ -653,6 +653,25 @@ def test_errors_name_field_value_and_what_is_allowed(field):
         Solver(**{field: 0})
 
 
+def test_a_solution_is_no_guess_by_itself():
+    with pytest.raises(ValueError, match=r"guess = Solution; allowed: .*Restart\(solution\) begins with a solution"):
+        Solver(guess=solved("minimum_energy").solution)
+
+
+def test_guesses_that_overflow_are_told_from_those_that_do_not_converge():
+    """Goddard's rocket in radii instead of altitudes: a guess of the order of a unit lies far below ground."""
+
+    def dynamics(t, x, u, p):
+        drag = 310.0 * x.v**2 * torch.exp(-500.0 * (x.h - 1.0))
+        return {"h": x.v, "v": (u.thrust - drag) / x.m - 1.0 / x.h**2, "m": -2.0 * u.thrust}
+
+    deep = replace(problem("goddard"), dynamics=dynamics, initial={"h": 1.0, "v": 0.0, "m": 1.0})
+    result = Solver(n_starts=2).solve(deep, 0)
+    assert not result.certified
+    assert "the equations are finite along no guess" in result.message
+    assert "altitudes, not radii" in result.message
+
+
 def test_a_problem_of_ones_own_takes_a_few_lines():
     """A pendulum swung up with the least torque: no costate equation is written."""
     swing = OptimalControlProblem(
