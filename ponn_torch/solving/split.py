@@ -111,6 +111,7 @@ class Split(Segmentation, Refinement):
     def _searched(self, search: _Search, start: Curve, blunter: Curve | None) -> Refined:
         rounds = search.rounds.results
         read: list[tuple[Structure, int]] = []
+        curves: list[Curve] = []
         rungs: list[tuple[float, singular_arcs.Stretch]] = []
         refined, singular = Refined(start, Outcome.STRUCTURE, rounds), None
         for smoothed, n_segments in self._starts(search, start):
@@ -119,8 +120,11 @@ class Split(Segmentation, Refinement):
             claimed = smoothed.collocation.setting.regime.arcs is not None
             structures = [claimed_structure(smoothed) if claimed else find_structure(smoothed, polish=0)]
             if smoothed.smoothing:
-                rungs.append((smoothed.smoothing, singular_arcs.undecided(smoothed, smoothed.smoothing)))
-                singular = singular_arcs.vanishing(rungs)
+                curves.append(smoothed)
+                if len(curves) > 1:  # one alone tells nothing, and most solves need no more
+                    late = curves[len(rungs) :]
+                    rungs += [(curve.smoothing, singular_arcs.undecided(curve, curve.smoothing)) for curve in late]
+                    singular = singular_arcs.vanishing(rungs)
                 if blunter is not None:
                     guessed = find_structure(smoothed, blunter)
                     # of the same arcs the curve's own times fit it better
