@@ -501,3 +501,15 @@ def test_settings_can_be_listed(
 def test_sweep_over_an_own_problem_is_understood(own_problem: Path) -> None:
     command = read(["-m", f"problem={own_problem}:shift", "problem.arguments.time=1,2"])
     assert command.multirun
+
+
+def test_a_run_does_not_clear_the_solution_that_it_restarts_from(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = tmp_path / "run"
+    assert main([*LANDING, "record=minimal", f"hydra.run.dir='{folder}'"]) == 0
+    for guess in (folder, folder / "solution"):
+        again = [*LANDING, "guess=solution", f"guess.solution='{guess}'", f"hydra.run.dir='{folder}'"]
+        assert main(again) == 1
+        assert "allowed: another folder than the run's own" in capsys.readouterr().err
+    assert (folder / "solution" / "solution.json").is_file()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -13,7 +14,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from ponn_torch.build import Plan, build, resolved
 from ponn_torch.cli.explain import explanation
-from ponn_torch.cli.job import CHECKPOINTS, DONE, INTERRUPTED, NOT_CERTIFIED, Outcome, run_job
+from ponn_torch.cli.job import BAD_INPUT, CHECKPOINTS, DONE, INTERRUPTED, NOT_CERTIFIED, Outcome, run_job
 from ponn_torch.cli.overrides import PONN
 from ponn_torch.cli.session import Tool, sweep_member
 from ponn_torch.optimal_control.problem import OptimalControlProblem
@@ -67,6 +68,12 @@ def run(
 
     ``plan`` is used if it was built from the same config. ``choices`` name the config of each group.
     """
+    guess = OmegaConf.select(config, "guess.solution")
+    if guess is not None and Path(guess).resolve() in (folder.resolve(), (folder / SOLUTION).resolve()):
+        # which would be gone before it is read again, as when the run is resumed
+        message = f"guess.solution = {str(guess)!r}; allowed: another folder than the run's own, which is cleared"
+        print(f"ponn: {message}", file=sys.stderr)
+        return Outcome(BAD_INPUT, message)
     return run_job(SolveJob(config, folder, overrides, plan, choices or {}), folder, overrides, slip=users_line)
 
 

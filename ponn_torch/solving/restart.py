@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 
+import torch
 from torch import Tensor
 
 from ponn_torch.numerics.nodes import make_nodes
@@ -29,12 +30,18 @@ class Restart:
     solved from the solution's states and costates as from any other guess.
 
     Attributes:
-        solution: a solution, or the folder that holds one: a run's, or what ``Solution.save`` wrote.
+        solution: a solution, or the folder of a run; what ``Solution.save`` wrote of a problem that is not made by a
+            reference is loaded with its problem first.
         otherwise: the guess of all starts but the first.
     """
 
-    solution: Solution | str
+    solution: Solution | str | Path
     otherwise: Guess = field(default_factory=RandomGuess)
+
+    def __post_init__(self) -> None:
+        given: object = self.solution
+        if not isinstance(given, Solution | str | Path):
+            raise ValueError(f"guess.solution = {type(given).__name__}; allowed: a Solution, or the folder of a run")
 
     @cached_property
     def _solved(self) -> Solution:
@@ -45,9 +52,8 @@ class Restart:
         try:
             return Solution.load(inner if inner.is_dir() else folder)
         except FileNotFoundError as error:
-            raise ValueError(
-                f"guess.solution = {self.solution!r}; allowed: the folder of a run or a solution"
-            ) from error
+            allowed = "the folder of a run or a solution"
+            raise ValueError(f"guess.solution = {str(self.solution)!r}; allowed: {allowed}") from error
 
     def curve(self, bvp: BoundaryValueProblem, seed: int) -> ScaledCurve:
         return self.otherwise.curve(bvp, seed) if seed % STREAMS else self._stretched(bvp, bvp.final_time)
@@ -81,7 +87,8 @@ class Restart:
             return None
         times = self._solved.curve.times.to(bvp.unit) * (made.bvp.time_unit / bvp.time_unit)
         if not bvp.problem.free_final_time:
-            times = times * (bvp.final_time / float(times[-1]))
+            end = times.new_tensor([bvp.final_time])  # to the last digit, as it is stated
+            times = torch.cat([times[:-1] * (bvp.final_time / float(times[-1])), end])
         bvp = with_singular_arcs(bvp, made.bvp.singular)
         nodes = make_nodes("legendre_gauss", len(disc.nodes), dtype=bvp.unit.dtype, device=bvp.unit.device)
         collocation = Collocation.on_segments(

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from ponn_torch.optim.base import Status
+from ponn_torch.optim.base import OptimizeResult, Status
 from ponn_torch.optimal_control.collocation import Collocation
 from ponn_torch.optimal_control.curve import Curve
 from ponn_torch.solving import refinement as refinements
@@ -111,9 +111,9 @@ class Run:
 
     def _one_start(self, collocation: Collocation, xi: Tensor) -> tuple[Solution | None, str]:
         """Everything between a first guess and a trajectory to be judged; None and why where that fails."""
-        restarted = self._restarted()
-        if restarted is not None:
-            return restarted, ""
+        restarted, note = self._restarted()
+        if restarted is not None or self.clock.spent:
+            return restarted, note
         stages, message = self._continuation(collocation, xi)
         if not stages:
             self.causes.append("not through the first stages")
@@ -141,16 +141,27 @@ class Run:
         closer = certify(again, self.solver.tolerances)
         return (again, closer) if closer.certified else (candidate, judged)
 
-    def _restarted(self) -> Solution | None:
-        """The arcs of a solution that the first start begins with, refined; None where there are none or that fails."""
+    def _restarted(self) -> tuple[Solution | None, str]:
+        """The arcs of a solution that the first start begins with, refined; None where there are none, or it fails."""
         guess, refinement = self.solver.guess, self.solver.refinement
         if self.stages.start or not isinstance(guess, Restart) or refinement is None or not refinement.reads_arcs:
-            return None
+            return None, ""
         curve = guess.on_its_arcs(self.stages.bvp)
         if curve is None:
-            return None
-        refined, note = self._refine(refinement, Solution(curve), None)
-        return None if note else refined
+            return None, ""
+        try:
+            refined, note = self._refine(refinement, Solution(curve), None)
+        except Interrupted:
+            self._keep_unsolved(curve, Status.INTERRUPTED)
+            raise
+        if note and self.clock.spent:
+            self._keep_unsolved(curve, Status.BUDGET)
+        return (None, note) if note else (refined, "")
+
+    def _keep_unsolved(self, curve: Curve, status: Status) -> None:
+        """What a restart began with, where nothing better was found in time."""
+        norm = curve.collocation.residual(curve.xi).norm()
+        self.stages.record("restart", curve, OptimizeResult(curve.xi, norm, status))
 
     # -- smoothed stages ---------------------------------------------------------------------------------------------
 

@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cache
 
 import pytest
 import torch
 from helpers import problem
 
+from ponn_torch.optimal_control.pontryagin import pontryagin
 from ponn_torch.optimal_control.problem import OptimalControlProblem
 from ponn_torch.optimal_control.references import load_problem
 from ponn_torch.problems.energy_landing import energy_landing
 from ponn_torch.problems.goddard import goddard
 from ponn_torch.problems.mars_landing import mars_landing
 from ponn_torch.solving.guess import RandomGuess
+from ponn_torch.solving.observer import SilentObserver
 from ponn_torch.solving.refinement import Outcome, Refined
 from ponn_torch.solving.restart import Restart
 from ponn_torch.solving.result import SolveResult
@@ -91,6 +94,31 @@ def test_where_the_arcs_do_not_serve_the_curve_does():
     assert result.stages[0].name == "smooth"
 
 
+class Impatient(SilentObserver):
+    """Ctrl-C in the first iteration."""
+
+    def iteration(self, record, iterate):
+        raise KeyboardInterrupt
+
+
+def test_what_a_restart_began_with_is_kept_where_it_is_ended_from_outside():
+    changed = mars_landing(final_time=46.0)
+    solver = Solver(guess=Restart(solved("mars_landing")))
+    interrupted = solver.solve(changed, 0, observer=Impatient())
+    assert interrupted.interrupted
+    assert interrupted.solution.arcs == ["max", "min", "max"]
+    spent = replace(solver, cpu_seconds=1e-9).solve(changed, 0)
+    assert spent.spent
+    assert "smooth" not in {stage.name for stage in spent.stages}
+    assert spent.solution.final_time == 46.0
+
+
+def test_a_fixed_final_time_is_what_is_stated_to_the_last_digit():
+    for final_time in (46.0, 47.3, 45.1):
+        bvp = pontryagin(mars_landing(final_time=final_time))
+        assert float(Restart(solved("mars_landing")).on_its_arcs(bvp).times[-1]) == bvp.final_time
+
+
 def test_further_starts_come_from_another_guess():
     guess, bvp = Restart(solved("mars_landing"), RandomGuess("normal")), solved("mars_landing").bvp
     t = torch.linspace(0.0, bvp.final_time, 5, dtype=torch.float64)
@@ -114,6 +142,8 @@ def test_a_saved_solution_serves_by_the_name_of_its_folder(tmp_path):
     ],
 )
 def test_what_cannot_serve_is_refused(given, message):
+    with pytest.raises(ValueError, match=r"guess.solution = int; allowed: a Solution, or the folder of a run"):
+        Restart(3)
     guess = Restart(given if given == "nowhere" else solved(given))
     with pytest.raises(ValueError, match=message):
         guess.curve(solved("mars_landing").bvp, 0)
