@@ -112,7 +112,7 @@ class Run:
     def _one_start(self, collocation: Collocation, xi: Tensor) -> tuple[Solution | None, str]:
         """Everything between a first guess and a trajectory to be judged; None and why where that fails."""
         restarted, note = self._restarted()
-        if restarted is not None or self.clock.spent:
+        if restarted is not None or (note and self.clock.spent):
             return restarted, note
         stages, message = self._continuation(collocation, xi)
         if not stages:
