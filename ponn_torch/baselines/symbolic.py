@@ -148,7 +148,8 @@ def _operations() -> dict[str, Callable[..., Any]]:
 
     def logsumexp(x: Any, dim: Any, keepdim: bool = False) -> Any:
         top = largest(x, dim, True)  # so that nothing overflows
-        return elementwise(ca.log)(total(elementwise(ca.exp)(x - top), dim, keepdim)) + largest(x, dim, keepdim)
+        kept = elementwise(ca.log)(total(elementwise(ca.exp)(x - top), dim, True)) + top
+        return kept if keepdim else np.squeeze(kept, axis=_axes(x, dim))
 
     def softplus(x: Any, beta: float = 1.0, threshold: float = 20.0) -> Any:
         # the other branch is evaluated as well, and must not overflow there

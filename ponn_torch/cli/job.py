@@ -13,7 +13,7 @@ from typing import Any, Protocol
 
 from omegaconf import OmegaConf
 
-from ponn_torch.reporting.members import OUTCOME, SOLUTION
+from ponn_torch.reporting.members import OUTCOME
 from ponn_torch.reporting.recorder import finite_or_none
 from ponn_torch.reporting.records import RECORDS
 from ponn_torch.reporting.report import (
@@ -26,6 +26,7 @@ from ponn_torch.reporting.report import (
     write_failure,
 )
 from ponn_torch.settings import ConfigError, one_line
+from ponn_torch.solving.solution import SOLUTION
 
 DONE, BAD_INPUT, NOT_CERTIFIED, BUG, INTERRUPTED = 0, 1, 2, 3, 130
 CONFIG, OVERRIDES, CHECKPOINTS = "config.yaml", "overrides.yaml", "checkpoints"

@@ -18,7 +18,7 @@ from ponn_torch.cli.job import BAD_INPUT, CHECKPOINTS, DONE, INTERRUPTED, NOT_CE
 from ponn_torch.cli.overrides import PONN
 from ponn_torch.cli.session import Tool, sweep_member
 from ponn_torch.optimal_control.problem import OptimalControlProblem
-from ponn_torch.reporting.members import BESIDES, SOLUTION
+from ponn_torch.reporting.members import BESIDES
 from ponn_torch.reporting.recorder import Recorder
 from ponn_torch.reporting.records import RECORDS, RunRecorder, recorded
 from ponn_torch.reporting.reference import Reference
@@ -28,7 +28,7 @@ from ponn_torch.settings import ConfigError, one_line, users_line
 from ponn_torch.solving.certificate import Certificate
 from ponn_torch.solving.journal import ForeignJournal, Journal
 from ponn_torch.solving.result import StageResult
-from ponn_torch.solving.solution import Solution, in_a_row
+from ponn_torch.solving.solution import SOLUTION, Solution, in_a_row
 
 CHOICES = "choices.yaml"
 

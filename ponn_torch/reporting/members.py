@@ -16,9 +16,9 @@ import torch
 from ponn_torch.reporting.records import RECORDS
 from ponn_torch.reporting.report import CERTIFICATE
 from ponn_torch.solving.certificate import Certificate
-from ponn_torch.solving.solution import Solution
+from ponn_torch.solving.solution import SOLUTION, Solution
 
-OUTCOME, SOLUTION = "outcome.json", "solution"
+OUTCOME = "outcome.json"
 BESIDES = ("record", "hydra", "threads")  # settings that change nothing of what is computed
 SOLVED = 0.1  # ‖r‖ of the last stage above which a run has not found an extremal
 

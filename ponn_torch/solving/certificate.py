@@ -166,7 +166,7 @@ def certify(solution: Solution, tolerances: Tolerances | None = None) -> Certifi
         "minimality": checks.minimality(solution, extremal, terms),
         "sign_violation": sign,
         "singular_share": singular,
-        "singular_violation": singular_arcs.violation(solution.curve) if solution.bvp.singular else None,
+        "singular_violation": singular_arcs.violation(solution.curve),
         "off_node_residual": solution.curve.mean_residual(),
         "transversality": transversality,
         "free_time": free_time,

@@ -17,9 +17,7 @@ from ponn_torch.optimal_control.curve import Curve
 from ponn_torch.optimal_control.discretisation import Strong, discretise
 from ponn_torch.optimal_control.pontryagin import with_singular_arcs
 from ponn_torch.solving.guess import STREAMS, Guess, RandomGuess, ScaledCurve, project
-from ponn_torch.solving.solution import Solution
-
-SOLUTION = "solution"  # where a run folder has it
+from ponn_torch.solving.solution import SOLUTION, Solution
 
 
 @dataclass(frozen=True)
@@ -65,8 +63,8 @@ class Restart:
             ValueError: a solution of other states.
         """
         solved = self._solved
-        if dict(solved.problem.states) != dict(bvp.problem.states):
-            found, allowed = dict(solved.problem.states), dict(bvp.problem.states)
+        found, allowed = dict(solved.problem.states), dict(bvp.problem.states)
+        if found != allowed:
             raise ValueError(f"guess.solution: states = {found}; allowed: {allowed}, those of {bvp.problem.name}")
         stretch = float(solved.curve.times[-1]) / final_time
 

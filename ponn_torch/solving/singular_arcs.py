@@ -8,23 +8,24 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from ponn_torch.optimal_control.boundary_value_problem import Setting
+from ponn_torch.optimal_control.boundary_value_problem import BoundaryValueProblem, Setting
 from ponn_torch.optimal_control.control_set import INTERIOR, LOWER, UPPER, Regime
 from ponn_torch.optimal_control.curve import Curve
-from ponn_torch.optimal_control.pontryagin import with_singular_arcs
 from ponn_torch.optimal_control.singular import clebsch, singular_components, singular_fractions
 from ponn_torch.solving.switching import (
     Structure,
+    along_arcs,
     claimed_structure,
-    depth_along,
     find_structure,
     grid,
     switching_along,
+    wrong_side,
 )
 
 ROUNDING = 1e-9  # of the terms of S̈, below which it does not depend on the control
@@ -111,7 +112,8 @@ def at_turned_switches(curve: Curve, tolerance: float) -> Structure | None:
     if not curve.collocation.bvp.law.jumps:
         return None
     claimed = claimed_structure(curve)
-    t, _, depth = depth_along(curve, claimed)
+    t, w, arc = along_arcs(curve)
+    depth = wrong_side(switching_along(curve, t, w), claimed.arcs[arc])
     found = claimed
     for time, events in zip(claimed.times.tolist(), claimed.events, strict=True):
         before, after = int((t < time).sum()), int((t <= time).sum())
@@ -128,8 +130,8 @@ def _plausible(curve: Curve, structure: Structure) -> bool:
     """Whether in the middle of every singular arc the control would be inside its bounds, with Legendre and Clebsch."""
     knots = torch.cat([curve.times[:1], structure.times, curve.times[-1:]])
     middle = 0.5 * (knots[1:] + knots[:-1])
-    fractions, admissible = _on_arcs(curve, middle, curve(middle), structure.arcs)
-    return admissible and bool((_outside(fractions, structure.arcs) <= 0).all())
+    there = middle, curve(middle), structure.arcs
+    return _convex(curve, *there) and bool((_past(curve, *there) <= 0).all())
 
 
 def at_bounds(curve: Curve, tolerance: float) -> Structure | None:
@@ -137,9 +139,9 @@ def at_bounds(curve: Curve, tolerance: float) -> Structure | None:
     found = claimed = claimed_structure(curve)
     if not curve.collocation.bvp.singular:
         return None
-    t, arc, _ = depth_along(curve, claimed)
+    t, w, arc = along_arcs(curve)
     codes = claimed.arcs[arc]
-    fractions, _ = _on_arcs(curve, t, curve(t), codes)
+    fractions = _fractions(curve, t, w, codes)
     for component in curve.collocation.bvp.singular:
         eta, on = fractions[:, component], codes[:, component] == INTERIOR
         for code, past in ((LOWER, -eta), (UPPER, eta - 1.0)):
@@ -153,23 +155,23 @@ def at_bounds(curve: Curve, tolerance: float) -> Structure | None:
 # -- admissible arcs -------------------------------------------------------------------------------------------------
 
 
-def violation(curve: Curve, n_points: int = 201) -> float:
+def violation(curve: Curve, n_points: int = 201) -> float | None:
     """How far the control leaves its range on singular arcs, in ranges; infinite without Legendre and Clebsch.
 
-    Looked at more closely where it comes near a bound between the points, as its peak may lie there.
+    None where no arc is singular. Looked at more closely where it comes near a bound between the points, as its peak
+    may lie there.
     """
     arcs = curve.collocation.setting.regime.arcs
     if not singular_components(curve.collocation.bvp.law, arcs):
-        return 0.0
+        return None
     assert arcs is not None
     z = torch.linspace(-1.0, 1.0, n_points, dtype=curve.xi.dtype, device=curve.xi.device)
     t, w, _, segment = curve.on_segments(z)
     fine, worst = torch.linspace(0.0, 1.0, 21, dtype=t.dtype, device=t.device), 0.0
     for _ in range(3):
-        fractions, admissible = _on_arcs(curve, t, w, arcs[segment])
-        if not admissible:
+        if not _convex(curve, t, w, arcs[segment]):
             return math.inf
-        past = _outside(fractions, arcs[segment]).amax(-1)
+        past = _past(curve, t, w, arcs[segment]).amax(-1)
         worst = max(worst, float(past.nan_to_num(math.inf).max()))
         same = segment[2:] == segment[:-2]
         peak = same & (past[1:-1] >= past[:-2]) & (past[1:-1] >= past[2:]) & (past[1:-1] > -NEARLY)
@@ -185,17 +187,28 @@ def violation(curve: Curve, n_points: int = 201) -> float:
     return max(worst, 0.0)
 
 
-def _outside(fractions: Tensor, arcs: Tensor) -> Tensor:
+def _past(curve: Curve, t: Tensor, w: Tensor, arcs: Tensor) -> Tensor:
     """How far η (m, k) is past its range, negative inside it; −1 where no arc is singular."""
-    return torch.where(arcs == INTERIOR, torch.maximum(-fractions, fractions - 1.0), -1.0)
+    eta = _fractions(curve, t, w, arcs)
+    return torch.where(arcs == INTERIOR, torch.maximum(-eta, eta - 1.0), -1.0)
 
 
-def _on_arcs(curve: Curve, t: Tensor, w: Tensor, arcs: Tensor) -> tuple[Tensor, bool]:
-    """η (m, k) at scaled times (m,) for arc codes (m, k), and whether Legendre and Clebsch's condition holds."""
-    bvp = curve.collocation.bvp
-    bvp = with_singular_arcs(bvp, singular_components(bvp.law, arcs))
-    parameters = curve.setting(torch.zeros_like(t, dtype=torch.long)).parameters
-    setting = Setting(Regime(arcs=arcs), parameters)
+def _fractions(curve: Curve, t: Tensor, w: Tensor, arcs: Tensor) -> Tensor:
+    """η (m, k) at scaled times (m,) for arc codes (m, k)."""
     with torch.no_grad():
-        fractions = singular_fractions(bvp, t[:, None], w, setting)
-        return fractions, bool((clebsch(bvp, t[:, None], w, setting) > ROUNDING).all())
+        return singular_fractions(*_at(curve, t, w, arcs))
+
+
+def _convex(curve: Curve, t: Tensor, w: Tensor, arcs: Tensor) -> bool:
+    """Whether Legendre and Clebsch's condition holds there."""
+    with torch.no_grad():
+        return bool((clebsch(*_at(curve, t, w, arcs)) > ROUNDING).all())
+
+
+def _at(curve: Curve, t: Tensor, w: Tensor, arcs: Tensor) -> tuple[BoundaryValueProblem, Tensor, Tensor, Setting]:
+    """The equations with what is singular on these arcs, and the points in the form that they take."""
+    bvp = curve.collocation.bvp
+    setting = curve.setting(torch.zeros_like(t, dtype=torch.long))
+    # nothing is solved here, so that couplings do not matter
+    bvp = replace(bvp, singular=singular_components(bvp.law, arcs))
+    return bvp, t[:, None], w, replace(setting, regime=Regime(arcs=arcs))

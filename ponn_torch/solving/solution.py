@@ -23,6 +23,7 @@ from ponn_torch.optimal_control.pontryagin import pontryagin, with_singular_arcs
 from ponn_torch.optimal_control.problem import DisplayUnit, OptimalControlProblem
 from ponn_torch.solving.storage import load_curve, save_curve
 
+SOLUTION = "solution"  # where the folder of a run has its own
 ARC_LABELS = {LOWER: "min", INTERIOR: "interior", UPPER: "max"}
 SINGULAR_LABELS = {**ARC_LABELS, INTERIOR: "singular"}  # where H is affine in the control
 TRAJECTORY = "trajectory.csv"

@@ -201,7 +201,7 @@ class Split(Segmentation, Refinement):
             repairs, coarse = self._repairs(solution, solved), self.coarse(solution, solved or regime.arcs is not None)
             if not solved:
                 outcome = Outcome.RESIDUAL
-            elif repairs or singular_arcs.violation(solution) > self.sign_tolerance:
+            elif repairs or (singular_arcs.violation(solution) or 0.0) > self.sign_tolerance:
                 curve, outcome = solution, Outcome.STRUCTURE
             else:
                 curve, outcome = solution, Outcome.COARSE

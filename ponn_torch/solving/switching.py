@@ -153,15 +153,14 @@ def wrong_side(switching: Tensor, codes: Tensor) -> Tensor:
     return torch.where(codes == INTERIOR, switching.abs(), depth) if affine else depth
 
 
-def depth_along(curve: Curve, claimed: Structure) -> tuple[Tensor, Tensor, Tensor]:
-    """Scaled times (m,) on a grid, the arc of each, and how far every S (m, n_switching) is on the wrong side there."""
+def along_arcs(curve: Curve) -> tuple[Tensor, Tensor, Tensor]:
+    """Scaled times (m,) and w (m, 2n) on a grid of a split curve, and the claimed arc that each point lies on."""
     collocation = curve.collocation
     n_points = max(100, 1000 // collocation.n_segments)
     t, w = grid(curve, n_points)
     starts = torch.tensor(collocation.switch_knots, dtype=torch.long)
     of_segment = torch.bucketize(torch.arange(collocation.n_segments), starts, right=True)
-    arc = of_segment.repeat_interleave(n_points).to(t.device)
-    return t, arc, wrong_side(switching_along(curve, t, w), claimed.arcs[arc])
+    return t, w, of_segment.repeat_interleave(n_points).to(t.device)
 
 
 def needles(curve: Curve, width: float, tolerance: float) -> list[Structure]:
@@ -176,7 +175,9 @@ def needles(curve: Curve, width: float, tolerance: float) -> list[Structure]:
         return []
     arcs, events = claimed.arcs, claimed.events
     ends = torch.cat([curve.times[:1], claimed.times, curve.times[-1:]])
-    t, arc, depth = depth_along(curve, claimed)
+    t, w, arc = along_arcs(curve)
+    switching = switching_along(curve, t, w)
+    depth = wrong_side(switching, arcs[arc])
     found: list[tuple[float, Structure]] = []
     for event, column in enumerate(depth.unbind(-1)):
         # runs of points on the wrong side, cut where an arc ends
@@ -189,8 +190,7 @@ def needles(curve: Curve, width: float, tolerance: float) -> list[Structure]:
             length = min(width * float(ends[-1] - ends[0]), 0.3 * float(ends[k + 1] - ends[k]))
             middle = float(t[peak].clamp(ends[k] + length, ends[k + 1] - length))
             new = [middle - 0.5 * length, middle + 0.5 * length]
-            above = bool(switching_along(curve, t[peak : peak + 1])[0, event] > 0)
-            needle = _other_side(arcs[k], event, depth.shape[-1], above)
+            needle = _other_side(arcs[k], event, depth.shape[-1], bool(switching[peak, event] > 0))
             pieces = [arcs[: k + 1], needle[None], arcs[k:]]
             if int(points[-1]) == len(run) - 1:
                 new, pieces = [float(ends[-1]) - length], pieces[:2]

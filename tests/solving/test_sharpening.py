@@ -10,30 +10,15 @@ import numpy as np
 import pytest
 import torch
 from helpers import collocation
+from test_singular_arcs import regulator
 from torch import Tensor
 
-from ponn_torch.optimal_control.control_laws import Box
 from ponn_torch.optimal_control.curve import Curve
 from ponn_torch.optimal_control.pontryagin import pontryagin
-from ponn_torch.optimal_control.problem import OptimalControlProblem
 from ponn_torch.solving.guess import project
 from ponn_torch.solving.sharpening import graded_times
 from ponn_torch.solving.singular_arcs import Stretch, undecided, vanishing
 from ponn_torch.solving.switching import switching_along
-
-
-def regulator(**final: float) -> OptimalControlProblem:
-    """min ½∫x² dt with ẋ = u, |u| ≤ 1, x(0) = 1: full speed to zero, then u = 0, which is singular."""
-    return OptimalControlProblem(
-        name="regulator",
-        states={"x": 1},
-        control=Box("u", 1.0, -1.0),
-        dynamics=lambda t, x, u, p: {"x": u.u},
-        running_cost=lambda t, x, u, p: 0.5 * (x.x**2).sum(-1, keepdim=True),
-        initial={"x": 1.0},
-        final=final,
-        final_time=3.0,
-    )
 
 
 def with_switching(s: Callable[[Tensor], Tensor]) -> Curve:
