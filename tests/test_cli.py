@@ -17,6 +17,7 @@ from tensorboard.plugins.hparams import plugin_data_pb2
 
 from ponn_torch.cli import main
 from ponn_torch.cli.overrides import read
+from ponn_torch.optimal_control.references import load_problem
 from ponn_torch.solving.solution import Solution
 
 OWN_PROBLEM = """
@@ -513,3 +514,16 @@ def test_a_run_does_not_clear_the_solution_that_it_restarts_from(
         assert main(again) == 1
         assert "allowed: another folder than the run's own" in capsys.readouterr().err
     assert (folder / "solution" / "solution.json").is_file()
+
+
+def test_an_own_problem_is_read_afresh_however_soon_it_is_edited(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Python would keep compiled code beside the file, and take it for current by size and second."""
+    monkeypatch.setattr(sys, "dont_write_bytecode", False)
+    file = tmp_path / "own.py"
+    for final_time in (1.0, 2.0):
+        file.write_text(OWN_PROBLEM.replace("time: float = 1.0", f"time: float = {final_time}"), encoding="utf-8")
+        os.utime(file, (1e9, 1e9))
+        assert load_problem(f"{file}:shift").time_guess == final_time
+    assert list(tmp_path.iterdir()) == [file]

@@ -9,8 +9,9 @@ import json
 import os
 import pkgutil
 import sys
+from importlib.machinery import SourceFileLoader
 from pathlib import Path
-from types import ModuleType
+from types import CodeType, ModuleType
 from typing import Any
 
 from ponn_torch.optimal_control.problem import OptimalControlProblem, ProblemOrigin, nearest
@@ -85,12 +86,19 @@ def _module(name: str) -> ModuleType:
         raise ValueError(f"problem module = {name!r}: {hint}") from None
 
 
+class _Afresh(SourceFileLoader):
+    """From the source every time: what Python keeps beside a file is stale if it is edited within a second."""
+
+    def get_code(self, fullname: str) -> CodeType:
+        return self.source_to_code(self.get_data(self.path), self.path)
+
+
 def _module_from_file(path: Path) -> ModuleType:
     if not path.is_file():
         siblings = [p.name for p in path.parent.glob("*.py")] if path.parent.is_dir() else []
         raise ValueError(f"problem file = {str(path)!r} does not exist; {nearest(path.name, siblings)}")
     name = f"ponn_problem_{path.stem}"
-    spec = importlib.util.spec_from_file_location(name, path)
+    spec = importlib.util.spec_from_file_location(name, path, loader=_Afresh(name, str(path)))
     if spec is None or spec.loader is None:
         raise ValueError(f"problem file = {str(path)!r} cannot be imported")
     module = importlib.util.module_from_spec(spec)
