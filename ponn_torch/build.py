@@ -217,6 +217,7 @@ def _solver(node: dict[str, Any], top: Mapping[str, Any]) -> Solver:
         "n_segments",
         "mass_variable",
         "start_limit",
+        "predictor",
         "warm_damping",
         "stage_tolerance",
         "trust",

@@ -43,6 +43,11 @@ def identity(norms: Tensor, previous: Tensor | None) -> Tensor:
 SCALINGS = {"marquardt": marquardt, "more": more, "identity": identity}
 
 
+def bounded(scale: Tensor) -> Tensor:
+    """D (..., N) without entries below a millionth of the largest: what no equation sees is to be damped too."""
+    return torch.maximum(scale, 1e-6 * scale.amax(-1, keepdim=True))
+
+
 AHEAD = 0.1  # of a step, where the curvature along it is read off
 HELPS = 0.5  # of ‖r‖, which a step with an old Jacobian has to leave at most, or it is taken back for a new one
 
@@ -180,9 +185,7 @@ class LevenbergMarquardt(Driven):
         return DampedState(xi, r, scale, damping, growth, contraction, *kept), move
 
     def _scale(self, jacobian: Jacobian, previous: Tensor | None) -> Tensor:
-        norms = jacobian.column_norms()
-        scale = SCALINGS[self.scaling](norms, previous)
-        return torch.maximum(scale, 1e-6 * scale.amax(-1, keepdim=True))
+        return bounded(SCALINGS[self.scaling](jacobian.column_norms(), previous))
 
     def _update(
         self, damping: Tensor, growth: Tensor, gain: Tensor, accepted: Tensor, running: Tensor

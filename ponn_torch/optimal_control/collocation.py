@@ -75,14 +75,19 @@ class Collocation(Layout):
                 raise ValueError(f"no parameter {name!r}; {nearest(name, ['smoothing', 'final_time', *values])}")
         return replace(out, setting=Setting(regime, values))
 
+    def value_of(self, parameter: str) -> float:
+        """What ``with_setting`` sets: the smoothing, the final time (s), or a named parameter."""
+        if parameter in self.setting.parameters:
+            return float(self.setting.parameters[parameter])
+        return float(self.known_times[-1]) * self.bvp.time_unit if parameter == "final_time" else self.smoothing
+
     def departures(self) -> dict[str, tuple[float, float]]:
         """Parameters, and a fixed final time in s, that are not as the problem states them: name → (here, stated)."""
         problem = self.bvp.problem
-        found = {
-            name: (float(self.setting.parameters.get(name, value)), value) for name, value in problem.parameters.items()
-        }
+        stated = dict(problem.parameters)
         if not problem.free_final_time:
-            found["final_time"] = float(self.known_times[-1]) * self.bvp.time_unit, problem.time_guess
+            stated["final_time"] = problem.time_guess
+        found = {name: (self.value_of(name), value) for name, value in stated.items()}
         round_off = 64 * torch.finfo(self.known_times.dtype).eps
         return {name: (a, b) for name, (a, b) in found.items() if abs(a - b) > round_off * abs(b)}
 

@@ -20,13 +20,14 @@ from ponn_torch.optimal_control.boundary_value_problem import BoundaryValueProbl
 from ponn_torch.optimal_control.discretisation import Discretisation, Form, Strong, discretise
 from ponn_torch.optimal_control.fingerprint import fingerprint
 from ponn_torch.optimal_control.measurements import MeasurementFile, Measurements
-from ponn_torch.optimal_control.problem import OptimalControlProblem
+from ponn_torch.optimal_control.problem import OptimalControlProblem, nearest
 from ponn_torch.solving.certificate import Tolerances
 from ponn_torch.solving.continuation import Ladder, Schedule
 from ponn_torch.solving.guess import Alternating, Guess, RandomGuess
 from ponn_torch.solving.journal import Journal
 from ponn_torch.solving.observer import Observer, SilentObserver
 from ponn_torch.solving.paths import PolarTransfer
+from ponn_torch.solving.predictor import PREDICTORS
 from ponn_torch.solving.refinement import Refinement
 from ponn_torch.solving.result import SolveResult
 from ponn_torch.solving.run import Run
@@ -61,6 +62,8 @@ class Solver:
         start_limit: ‖r‖ above which a first stage has failed, and at the next smoothing the start; where nothing is
             smoothed and the iteration has settled, it is the ansatz that is too coarse, and the refinement goes on
             from there.
+        predictor: where a stage begins that follows another: ``tangent`` to the solutions, of ansätze whose weights are
+            linear, or ``none``, where the other ended.
         warm_damping: first damping of a stage that starts from the one before, if the optimiser asks for more.
         stage_tolerance: ‖r‖ at which a stage ends that only leads to a refinement, if the optimiser asks for less.
         trust: a stage is kept while its off-node residual is below this fraction of the largest rate; below the
@@ -83,6 +86,7 @@ class Solver:
     n_starts: int = 12
     n_certified: int = 1
     start_limit: float = 0.1
+    predictor: str = "tangent"
     warm_damping: float = 1e-5
     stage_tolerance: float = 1e-3
     trust: float = 0.02
@@ -105,6 +109,8 @@ class Solver:
             )
         if not self._pieces or min(self._pieces) < 1:
             raise ValueError(f"n_segments = {self.n_segments}; allowed: at least 1, or a list of such numbers")
+        if self.predictor not in PREDICTORS:
+            raise ValueError(f"predictor = {self.predictor!r}; {nearest(self.predictor, PREDICTORS)}")
         if not self.warm_damping >= 0:
             raise ValueError(f"warm_damping = {self.warm_damping}; allowed: a number ≥ 0")
         if self.dtype != torch.float64 and self.exact:  # whose rounds end far below the round-off of float32

@@ -104,10 +104,13 @@ class Stages:
 
         return on_iteration
 
+    def residual(self, collocation: Collocation) -> Residual:
+        """What the smoothed stages solve: the equations, and the measurements where there are any."""
+        return collocation if self.measurements is None else Measured(collocation, self.measurements)
+
     def optimise(self, name: str, collocation: Collocation, xi: Tensor, optimizer: Optimizer) -> OptimizeResult:
         self.observer.stage_started(name, collocation.smoothing or None, len(self.done))
-        measured = self.measurements
-        residual: Residual = collocation if measured is None else Measured(collocation, measured)
+        residual = self.residual(collocation)
         told = self.callback(collocation, residual)
         if self.journal is None:
             result = optimizer.run(residual, xi, told)

@@ -6,11 +6,12 @@ from dataclasses import dataclass, field, replace
 
 from torch import Tensor
 
-from ponn_torch.optim.base import NonFiniteResidual, OptimizeResult, warm
+from ponn_torch.optim.base import NonFiniteResidual, OptimizeResult, Residual, warm
 from ponn_torch.optimal_control.collocation import Collocation
 from ponn_torch.optimal_control.curve import Curve
 from ponn_torch.optimal_control.discretisation import Form
 from ponn_torch.solving.continuation import Outcome
+from ponn_torch.solving.predictor import along_tangent
 from ponn_torch.solving.sharpening import legible
 from ponn_torch.solving.solution import Solution
 from ponn_torch.solving.stages import Stages
@@ -41,11 +42,12 @@ class Walk:
         trial = replace(self.collocation, discretisation=stages.discretisation(form))
         if smoothed:
             trial = trial.with_setting(**{parameter: value})
-        optimizer = stages.optimizer
+        optimizer, xi = stages.optimizer, self.xi
         if self.begun:
             optimizer = warm(optimizer, stages.solver.warm_damping)
+            xi = self._predicted(trial, parameter, value)
         try:
-            result = stages.optimise("smooth", trial, self.xi, optimizer)
+            result = stages.optimise("smooth", trial, xi, optimizer)
         except NonFiniteResidual as error:
             self.message = str(error)
             return Outcome.FAILED if self.begun else Outcome.ABORT
@@ -55,6 +57,17 @@ class Walk:
         if norm < stages.solver.start_limit:
             return self._advanced(trial, result.xi, solution, hold)
         return Outcome.FAILED if self.begun else self._not_begun(solution, result, norm, parameter)
+
+    def _predicted(self, trial: Collocation, parameter: str, value: float) -> Tensor:
+        """Where the stage begins. Of a network that is trained no tangent is known: its Jacobian leaves many."""
+        solver, here = self.stages.solver, self.collocation.value_of(parameter)
+        if solver.predictor == "none" or len(trial.linear_unknowns) < trial.n_unknowns:
+            return self.xi
+
+        def residual(at: float) -> Residual:
+            return self.stages.residual(trial.with_setting(**{parameter: at}))
+
+        return along_tangent(residual, self.xi, here, value, solver.warm_damping)
 
     def arrive(self) -> None:
         """End at the problem as stated: a last stage where the schedule ended at another value of a parameter.
