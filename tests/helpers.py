@@ -145,6 +145,6 @@ def collocation(
     disc = Discretisation(bvp, basis(n_neurons), nodes, form or Strong(), conditioning)
     times = torch.linspace(0.0, 1.0, n_segments + 1, dtype=torch.float64) * bvp.final_time
     made = Collocation.on_segments(disc, times)
-    if smoothing is not None and bvp.law.n_switching and not bvp.law.curved:
+    if smoothing is not None and bvp.law.jumps:
         made = made.with_setting(smoothing=smoothing)
     return made

@@ -118,7 +118,7 @@ class DirectSolution:
         split, bvp = split or Split(), pontryagin(self.problem)
         times = self._node_times[:: self.program.degree].contiguous()
         parameters = {name: times.new_tensor(value) for name, value in self.problem.parameters.items()}
-        codes = [p.codes or (0,) * self.program.variables.n_bounded for p in self.program.phases]
+        codes = [p.codes or (0,) * len(self.program.variables.bounded) for p in self.program.phases]
         arcs = torch.tensor([c for c, p in zip(codes, self.program.phases, strict=True) for _ in range(p.n_segments)])
         setting = Setting(Regime(arcs=arcs), parameters)
         collocation = Collocation.on_segments(split.discretisation(bvp), times, setting=setting)

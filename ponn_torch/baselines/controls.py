@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import accumulate, pairwise
 
 import torch
 from torch import Tensor
@@ -30,7 +31,7 @@ class ControlVariables:
 
     Attributes:
         free: limits of ν where nothing is known. pinned: arc codes → limits on such an arc.
-        start: a value inside. n_bounded: so many of the first variables are the bounded scalars that arcs pin.
+        start: a value inside. bounded: places of the bounded scalars that arcs pin, in the order of their codes.
         controls: ν → controls by name, as the dynamics read them. inverse: controls → ν.
         rows: ν → (..., k), rows of the program; None where bounds say everything.
     """
@@ -38,7 +39,7 @@ class ControlVariables:
     free: Limits
     pinned: Callable[[Sequence[int]], Limits]
     start: Sequence[float]
-    n_bounded: int
+    bounded: Sequence[int]
     controls: Callable[[Tensor], dict[str, Tensor]]
     inverse: Callable[[Mapping[str, Tensor]], Tensor]
     rows: Callable[[Tensor], Tensor] | None = None
@@ -60,14 +61,56 @@ def control_variables(problem: OptimalControlProblem, softening: float) -> Contr
     Raises:
         TypeError: a control set of another kind.
     """
-    law = problem.control
+    return _side_by_side([_variables(law, problem, softening) for law in problem.control.factors])
+
+
+def _variables(law: ControlSet, problem: OptimalControlProblem, softening: float) -> ControlVariables:
     if isinstance(law, ThrustBall):
         return _thrust_ball(law, problem, softening)
     if isinstance(law, Box):
         return _box(law, problem)
     if isinstance(law, Unconstrained):
         return _unconstrained(law, problem)
-    raise TypeError(f"control set {type(law).__name__}; allowed: ThrustBall, Box, Unconstrained")
+    raise TypeError(f"control set {type(law).__name__}; allowed: ThrustBall, Box, Unconstrained, and products of these")
+
+
+def _side_by_side(each: Sequence[ControlVariables]) -> ControlVariables:
+    """The variables of several sets, one after the other."""
+    if len(each) == 1:
+        return each[0]
+    sizes, n_codes = [one.size for one in each], [len(one.bounded) for one in each]
+    ruled = [i for i, one in enumerate(each) if one.rows is not None]
+
+    def limits(of: Sequence[Limits]) -> Limits:
+        return Limits(*([x for piece in side for x in piece] for side in zip(*map(_sides, of), strict=True)))
+
+    def pinned(codes: Sequence[int]) -> Limits:
+        ends = [*accumulate(n_codes, initial=0)]
+        return limits([one.pinned(codes[a:b]) for one, (a, b) in zip(each, pairwise(ends), strict=True)])
+
+    def rows(nu: Tensor) -> Tensor:
+        pieces = nu.split(sizes, -1)
+        return torch.cat([each[i].rows(pieces[i]) for i in ruled], -1)  # type: ignore[misc]
+
+    def controls(nu: Tensor) -> dict[str, Tensor]:
+        pieces = zip(each, nu.split(sizes, -1), strict=True)
+        return {name: value for one, piece in pieces for name, value in one.controls(piece).items()}
+
+    return ControlVariables(
+        free=limits([one.free for one in each]),
+        pinned=pinned,
+        start=[x for one in each for x in one.start],
+        bounded=[
+            start + i for one, start in zip(each, accumulate(sizes, initial=0), strict=False) for i in one.bounded
+        ],
+        controls=controls,
+        inverse=lambda control: torch.cat([one.inverse(control) for one in each], -1),
+        rows=rows if ruled else None,
+    )
+
+
+def _sides(limits: Limits) -> tuple[Sequence[float], ...]:
+    return limits.lower, limits.upper, limits.row_lower, limits.row_upper
 
 
 def _thrust_ball(law: ThrustBall, problem: OptimalControlProblem, softening: float) -> ControlVariables:
@@ -99,7 +142,7 @@ def _thrust_ball(law: ThrustBall, problem: OptimalControlProblem, softening: flo
         free=limits(least, 1.0),
         pinned=lambda codes: arcs.get(codes[0], limits(least, 1.0)),
         start=[0.5 * (1.0 + least), *[0.25 / size**0.5] * size],
-        n_bounded=1,
+        bounded=(0,),
         controls=lambda nu: {name: high * nu[..., 1:], f"{name}_magnitude": high * nu[..., :1]},
         inverse=lambda control: torch.cat([control[f"{name}_magnitude"], control[name]], -1) / high,
         rows=rows,
@@ -112,7 +155,7 @@ def _box(law: Box, problem: OptimalControlProblem) -> ControlVariables:
         free=Limits([0.0] * law.size, [1.0] * law.size),
         pinned=lambda codes: Limits([float(c == UPPER) for c in codes], [float(c != LOWER) for c in codes]),
         start=[0.5] * law.size,
-        n_bounded=law.size,
+        bounded=range(law.size),
         controls=lambda nu: {law.name: low + (high - low) * nu},
         inverse=lambda control: (control[law.name] - low) / (high - low),
     )
@@ -125,7 +168,7 @@ def _unconstrained(law: Unconstrained, problem: OptimalControlProblem) -> Contro
         free=limits,
         pinned=lambda codes: limits,
         start=[0.0] * law.size,
-        n_bounded=0,
+        bounded=(),
         controls=lambda nu: {law.name: unit * nu},
         inverse=lambda control: control[law.name] / unit,
     )
@@ -136,9 +179,11 @@ def _natural_unit(law: ControlSet, problem: OptimalControlProblem) -> float:
     (name, size), units = next(iter(law.names.items())), problem_units(problem)
     x, t = units[None], units.new_full((1, 1), problem.time_guess)
     p = Named(**{key: torch.full_like(t, value) for key, value in problem.parameters.items()})
+    others = problem.control.probe(torch.ones_like(t))
 
     def rates(control: Tensor) -> Tensor:
-        return problem.stack(problem.dynamics(t, problem.named(x), Named(**{name: control}), p), x)[0] / units
+        u = Named(**{**others, name: control})
+        return problem.stack(problem.dynamics(t, problem.named(x), u, p), x)[0] / units
 
     slopes = torch.func.jacrev(rates)(units.new_full((1, size), 1e-3))
     return 1.0 / (float(slopes.abs().max()) * problem.unit("time"))

@@ -20,7 +20,7 @@ from ponn_torch.baselines.answer import DirectSolution
 from ponn_torch.baselines.transcription import Answer, Array, PathConstraints, Phase, Point, Program
 from ponn_torch.optim.base import Stopwatch
 from ponn_torch.optimal_control.boundary_value_problem import Setting
-from ponn_torch.optimal_control.control_set import LOWER, UPPER, Regime
+from ponn_torch.optimal_control.control_set import INTERIOR, LOWER, UPPER, ControlSet, Regime
 from ponn_torch.optimal_control.pontryagin import pontryagin
 from ponn_torch.optimal_control.problem import OptimalControlProblem
 from ponn_torch.solving.guess import Guess
@@ -140,7 +140,7 @@ class TwoStage:
         if not best.solved or not bvp.law.jumps:
             return best
         iterations, seconds, build = best.n_iterations, best.cpu_seconds, best.build_seconds
-        codes, durations = _arcs_by_fraction(best)
+        codes, durations = _arcs_by_fraction(best, bvp.law)
         for _ in range(self.max_rounds):
             program = self._program(problem, codes, durations)
             build += program.build()
@@ -203,24 +203,36 @@ def _solution(program: Program, answer: Answer, iterations: int, seconds: float,
 # -- from one program to the next ------------------------------------------------------------------------------------
 
 
-def _arcs_by_fraction(solution: DirectSolution) -> tuple[list[Codes], Array]:
-    """Arc codes and scaled durations from the mean of the control over every segment of an unstructured answer."""
+def _arcs_by_fraction(solution: DirectSolution, law: ControlSet) -> tuple[list[Codes], Array]:
+    """Arc codes and scaled durations from the mean of the control over every segment of an unstructured answer.
+
+    Components that do not jump are left to the program on every phase, as in the interior.
+    """
     program, limits = solution.program, solution.program.variables.free
-    bounded = slice(0, program.variables.n_bounded)
-    lower, upper = np.array(limits.lower[bounded]), np.array(limits.upper[bounded])
+    bounded = list(program.variables.bounded)
+    lower, upper = np.array(limits.lower)[bounded], np.array(limits.upper)[bounded]
     fraction = (solution.answer.point.controls[:, bounded] - lower) / (upper - lower)
     mean = np.einsum("j,kjm->km", program.rule.weights, fraction.reshape(program.n_segments, program.degree, -1))
-    codes = [tuple(row) for row in np.where(mean > 0.5, UPPER, LOWER).tolist()]
+    arcs = np.where(mean > 0.5, UPPER, LOWER)
+    arcs[:, [i for i in range(len(bounded)) if i not in law.jumping]] = INTERIOR
+    codes = [tuple(row) for row in arcs.tolist()]
     return _merged(codes, np.full(len(codes), solution.answer.point.durations.sum() / len(codes)))
 
 
 def _switching(solution: DirectSolution, n_points: int = 4000) -> tuple[Tensor, Tensor, Tensor]:
-    """Scaled times (m,), S (m, c) from the multipliers, and the arc codes (m, c) that it asks for."""
+    """Scaled times (m,), S (m, c) of every component from the multipliers, and the arc codes (m, c) that it asks for.
+
+    Of a component that does not jump S is zero, and its code that of the interior.
+    """
     bvp = pontryagin(solution.problem, mass_variable="mass", chains=False)
     t = torch.linspace(0.0, solution.final_time / bvp.time_unit, n_points, dtype=torch.float64)
     p = {name: torch.full_like(t[:, None], value) for name, value in solution.problem.parameters.items()}
-    s = bvp.switching(t[:, None], solution.curve(bvp)(t), Setting(Regime(), p))
-    return t, s, bvp.law.arc_codes(s)
+    switching = bvp.switching(t[:, None], solution.curve(bvp)(t), Setting(Regime(), p))
+    asked, s = bvp.law.arc_codes(switching), switching.new_zeros(len(t), bvp.law.n_bounded)
+    codes = torch.full_like(asked, INTERIOR)
+    for component, function in bvp.law.jumping.items():
+        codes[:, component], s[:, component] = asked[:, component], switching[:, function]
+    return t, s, codes
 
 
 def _transferred(solution: DirectSolution, program: Program, durations: Array) -> Point:

@@ -4,7 +4,7 @@ A bounded scalar control is written lower + (upper − lower) η with η ∈ [0,
 constant in cost per time. Three regimes:
 
 - smoothed, H affine in η: ``s ρ e(η)`` is added to the running cost, so the minimum principle stays exact at every ρ;
-- H a convex parabola in η (``curved``): the minimiser is S/curvature clipped to [0, 1] and needs no smoothing;
+- H a convex parabola in η (``convex``): the minimiser is S/curvature clipped to [0, 1] and needs no smoothing;
 - on an arc: the control is at the bound, or in the interior, that the arc's code names. Where H is affine such an
   arc is singular, S = 0 all along it, and η comes from outside (singular.py).
 """
@@ -12,7 +12,7 @@ constant in cost per time. Three regimes:
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import KW_ONLY, dataclass, field, replace
 from typing import Any, ClassVar
 
@@ -22,10 +22,12 @@ from torch import Tensor
 from ponn_torch.numerics.autodiff import gradients
 from ponn_torch.optimal_control import sampling
 from ponn_torch.optimal_control.control_set import (
+    INTERIOR,
     LOWER,
     UPPER,
     ControlSet,
     Hamiltonian,
+    Level,
     Minimiser,
     Regime,
     Unbounded,
@@ -34,22 +36,29 @@ from ponn_torch.optimal_control.control_set import (
 from ponn_torch.optimal_control.regularisers import Entropy, Regulariser
 
 
-def _fraction(at_lower: Tensor, at_upper: Tensor, curved: bool, law: Bounded, regime: Regime) -> Tensor:
+def _fraction(at_lower: Tensor, at_upper: Tensor, law: Bounded, regime: Regime) -> Tensor:
     """η (..., m) from S at both bounds: ``at_lower`` = S(η=0), ``at_upper`` = S(η=1), equal where H is affine."""
-    if curved:
+
+    def vertex() -> Tensor:
         curvature = at_lower - at_upper
-        free = at_lower / torch.where(curvature > 0, curvature, torch.ones_like(curvature))
-        smooth = free.clamp(0.0, 1.0)
-    elif regime.arcs is None:
-        if regime.smoothing is None:
-            return (at_lower > 0).to(at_lower.dtype)
-        return law.regulariser.fraction(at_lower - law.switching_level, regime.smoothing)
-    else:
-        free = smooth = 0.5 * torch.ones_like(at_lower) if regime.interior is None else regime.interior
+        return at_lower / torch.where(curvature > 0, curvature, torch.ones_like(curvature))
+
     if regime.arcs is None:
-        return smooth
+        return law.by_kind(at_lower, lambda: _jump(at_lower, law, regime.smoothing), lambda: vertex().clamp(0.0, 1.0))
+
+    def singular() -> Tensor:
+        return 0.5 * torch.ones_like(at_lower) if regime.interior is None else regime.interior
+
+    free = law.by_kind(at_lower, singular, vertex)
     zero, one = torch.zeros_like(at_lower), torch.ones_like(at_lower)
     return torch.where(regime.arcs == LOWER, zero, torch.where(regime.arcs == UPPER, one, free))
+
+
+def _jump(switching: Tensor, law: Bounded, smoothing: Tensor | None) -> Tensor:
+    """η from one bound to the other where S changes its sign, at once or smoothed."""
+    if smoothing is None:
+        return (switching > 0).to(switching.dtype)
+    return law.regulariser.fraction(switching - law.switching_level, smoothing)
 
 
 # -- probes of H -----------------------------------------------------------------------------------------------------
@@ -152,7 +161,8 @@ class Bounded(ControlSet):
     """What thrust balls and boxes share: bounds (numbers, or names of parameters), a regulariser, a scale.
 
     ``cost_rate`` is s per unit of control, in cost per time and control; found by a probe of H where it is None.
-    ``switching_level`` is S_c of the PoNN paper's eq. 45. ``curved`` is set by ``adapted``.
+    ``switching_level`` is S_c of the PoNN paper's eq. 45. ``convex`` are the components that H is a convex parabola in,
+    ascending, and no affine function; ``adapted`` finds them.
     """
 
     name: str
@@ -163,7 +173,7 @@ class Bounded(ControlSet):
     regulariser: Regulariser = field(default_factory=Entropy)
     switching_level: float = 0.0
     cost_rate: float | tuple[float, ...] | None = None
-    curved: bool = False
+    convex: tuple[int, ...] = ()
 
     least: ClassVar[float] = -math.inf
     allowed: ClassVar[str] = "a finite number, or the name of a parameter"
@@ -208,19 +218,32 @@ class Bounded(ControlSet):
         low, high = self.bounds(None, one)
         return one * (low + SHARE * (high - low))
 
-    def arc_codes(self, switching: Tensor) -> Tensor:
-        if not self.curved:
-            return torch.where(switching > 0, UPPER, LOWER)
-        at_lower, at_upper = switching.chunk(2, -1)
-        return (at_lower > 0).long() + (at_upper > 0).long()
+    @property
+    def n_scalars(self) -> int:
+        """Bounded components."""
+        return self.size
+
+    @property
+    def levels(self) -> tuple[Level, ...]:
+        first = [Level(i, LOWER, INTERIOR if i in self.convex else UPPER) for i in range(self.n_scalars)]
+        return (*first, *(Level(i, INTERIOR, UPPER) for i in self.convex))
+
+    def by_kind(self, like: Tensor, affine: Callable[[], Tensor], convex: Callable[[], Tensor]) -> Tensor:
+        """Values (..., m), each component's by its kind; what no component needs is not computed."""
+        if len(self.convex) in (0, self.n_scalars):
+            return convex() if self.convex else affine()
+        which = torch.tensor([i in self.convex for i in range(self.n_scalars)], device=like.device)
+        return torch.where(which, convex(), affine())
 
     def penalty(self, minimiser: Minimiser, p: Any, smoothing: Tensor) -> Tensor:
-        if self.curved:
-            return torch.zeros_like(smoothing)
         low, high = self.bounds(p, smoothing)
         eta = minimiser.fraction
-        reward = smoothing * self.regulariser.penalty(eta) + self.switching_level * eta
-        return (self._rate(smoothing) * (high - low) * reward).sum(-1, keepdim=True)
+
+        def reward() -> Tensor:
+            weight = smoothing * self.regulariser.penalty(eta) + self.switching_level * eta
+            return self._rate(smoothing) * (high - low) * weight
+
+        return self.by_kind(eta, reward, lambda: torch.zeros_like(eta)).sum(-1, keepdim=True)
 
     def _rate(self, like: Tensor) -> Any:
         if self.cost_rate is None:
@@ -232,7 +255,10 @@ class Bounded(ControlSet):
         return gain / self._rate(gain)
 
     def _switching(self, at_lower: Tensor, at_upper: Tensor) -> Tensor:
-        return torch.cat([at_lower, at_upper], -1) if self.curved else at_lower
+        if not self.convex:
+            return at_lower
+        every = len(self.convex) == self.n_scalars
+        return torch.cat([at_lower, at_upper if every else at_upper[..., list(self.convex)]], -1)
 
 
 @dataclass(frozen=True)
@@ -256,8 +282,8 @@ class ThrustBall(Bounded):
         return {self.name: self.size, f"{self.name}_magnitude": 1}
 
     @property
-    def n_switching(self) -> int:
-        return 2 if self.curved else 1
+    def n_scalars(self) -> int:
+        return 1
 
     def _controls(self, vector: Tensor, magnitude: Tensor) -> dict[str, Tensor]:
         return {self.name: vector, f"{self.name}_magnitude": magnitude}
@@ -291,11 +317,11 @@ class ThrustBall(Bounded):
             raise ValueError(f"{self.name}: the Hamiltonian is neither affine nor quadratic in its magnitude")
         if _nowhere_convex(bend, first, last):
             raise ValueError(f"{self.name}: the Hamiltonian is concave in its magnitude; allowed: affine or convex")
-        curved = not _negligible(bend, first, last)
+        convex = () if _negligible(bend, first, last) else (0,)
         slope = ((cost(**self._controls(vector, zero + high)) - cost(**self._controls(vector, zero))) / high).flatten()
         constant = float(slope.min()) > 0 and float(slope.max() - slope.min()) <= 1e-9 * float(slope.max())
         rate = self.cost_rate or (float(slope[0]) if constant else unit / float(high.max()))
-        return replace(self, curved=curved, cost_rate=rate)
+        return replace(self, convex=convex, cost_rate=rate)
 
     def minimise(self, h: Hamiltonian, p: Any, like: Tensor, regime: Regime) -> Minimiser:
         low, high = self.bounds(p, like)
@@ -307,8 +333,8 @@ class ThrustBall(Bounded):
         inverse = torch.rsqrt(torch.where(some, square, 1.0))
         norm = square * inverse
         at_lower = self._scaled(norm - slope)
-        at_upper = self._scaled(norm - self._slopes(h, vector, zero + high)[1]) if self.curved else at_lower
-        fraction = _fraction(at_lower, at_upper, self.curved, self, regime)
+        at_upper = self._scaled(norm - self._slopes(h, vector, zero + high)[1]) if self.convex else at_lower
+        fraction = _fraction(at_lower, at_upper, self, regime)
         magnitude = low + (high - low) * fraction
         control = self._controls(-(magnitude * inverse) * primer, magnitude)
         return Minimiser(control, self._switching(at_lower, at_upper), fraction)
@@ -327,7 +353,7 @@ class ThrustBall(Bounded):
 
 @dataclass(frozen=True)
 class Box(Bounded):
-    """Components with minimum ≤ u_i ≤ maximum, each entering H apart from the others, all affine or all convex.
+    """Components with minimum ≤ u_i ≤ maximum, each entering H apart from the others, affine or convex.
 
     A bound may also be a sequence of numbers, one per component. Convex means quadratic; where H is anything else, or
     convex for some costates and concave for others, ``Stationary`` finds minima inside the range.
@@ -349,10 +375,6 @@ class Box(Bounded):
     def names(self) -> dict[str, int]:
         return {self.name: self.size}
 
-    @property
-    def n_switching(self) -> int:
-        return (2 if self.curved else 1) * self.size
-
     def probe(self, one: Tensor) -> dict[str, Tensor]:
         return {self.name: self._inside(one).expand(*one.shape[:-1], self.size)}
 
@@ -364,7 +386,7 @@ class Box(Bounded):
         low, high = (torch.as_tensor(b, dtype=one.dtype) for b in self.bounds(p, one))
         self._check_room(low, high)
         span = (high - low).expand(*one.shape[:-1], self.size)
-        start, curved = 0.5 + 0.5 * _random(one, self.size), []
+        start, convex = 0.5 + 0.5 * _random(one, self.size), []
         for i in range(self.size):
             slopes = []
             for share in (0.0, SHARE, 1.0):
@@ -386,22 +408,18 @@ class Box(Bounded):
                     f"{self.name}: the Hamiltonian is concave in component {i}; allowed: affine or convex, whatever "
                     "the signs of the costates; Stationary over the same range takes the lowest H, wherever it is"
                 )
-            curved.append(not _negligible(bend, first, last))
-        if len(set(curved)) > 1:
-            raise ValueError(
-                f"{self.name}: the Hamiltonian is affine in component {curved.index(False)} and curved in component "
-                f"{curved.index(True)}; a box needs all of one kind"
-            )
+            if not _negligible(bend, first, last):
+                convex.append(i)
         rates = tuple(unit / width for width in span.amax(0).tolist())
         rate = self.cost_rate or (rates[0] if len(set(rates)) == 1 else rates)
-        return replace(self, curved=curved[0], cost_rate=rate)
+        return replace(self, convex=tuple(convex), cost_rate=rate)
 
     def minimise(self, h: Hamiltonian, p: Any, like: Tensor, regime: Regime) -> Minimiser:
         low, high = self.bounds(p, like)
         zero = torch.zeros_like(like).expand(*like.shape[:-1], self.size)
         at_lower = self._scaled(-self._slope(h, zero + low))
-        at_upper = self._scaled(-self._slope(h, zero + high)) if self.curved else at_lower
-        fraction = _fraction(at_lower, at_upper, self.curved, self, regime)
+        at_upper = self._scaled(-self._slope(h, zero + high)) if self.convex else at_lower
+        fraction = _fraction(at_lower, at_upper, self, regime)
         return Minimiser({self.name: low + (high - low) * fraction}, self._switching(at_lower, at_upper), fraction)
 
     def samples(self, minimiser: Minimiser, p: Any) -> Minimiser:

@@ -7,7 +7,7 @@ state and costate. *Switching functions* are the scalars whose zeros separate th
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple, Protocol
 
@@ -17,6 +17,19 @@ from torch import Tensor
 Hamiltonian = Callable[..., Tensor]
 
 LOWER, INTERIOR, UPPER = 0, 1, 2  # codes of an arc
+
+
+class Level(NamedTuple):
+    """What one switching function decides: the codes that a component has where it is below and above zero."""
+
+    component: int
+    below: int
+    above: int
+
+    @property
+    def jumps(self) -> bool:
+        """Whether H is affine in the component, which then jumps between its bounds unless it is smoothed."""
+        return self.above - self.below > 1
 
 
 class Minimiser(NamedTuple):
@@ -52,29 +65,43 @@ class ControlSet(Protocol):
     """The admissible controls and the minimiser of the Hamiltonian over them."""
 
     @property
+    def factors(self) -> Sequence[ControlSet]:
+        """The sets that this one is a product of: itself alone, for most."""
+        return (self,)
+
+    @property
     def names(self) -> dict[str, int]:
         """Names and sizes of the controls that the dynamics read."""
         ...
 
     @property
-    def n_switching(self) -> int:
-        """Number of switching functions; 0 where the control has no bound."""
+    def levels(self) -> tuple[Level, ...]:
+        """What every switching function decides; none where the control has no bound.
+
+        A component that H is affine in has one, which separates its bounds; where H is convex in it there are two, that
+        at the lower bound first.
+        """
         ...
 
     @property
-    def curved(self) -> bool:
-        """Whether H is convex in the bounded control: every component then has two switching functions."""
-        ...
+    def n_switching(self) -> int:
+        """Number of switching functions."""
+        return len(self.levels)
+
+    @property
+    def jumping(self) -> dict[int, int]:
+        """Bounded components that H is affine in, each with its switching function."""
+        return {level.component: function for function, level in enumerate(self.levels) if level.jumps}
 
     @property
     def jumps(self) -> bool:
-        """Whether H is affine in a bounded control, which then jumps between its bounds unless it is smoothed."""
-        return self.n_switching > 0 and not self.curved
+        """Whether there are such components."""
+        return bool(self.jumping)
 
     @property
     def n_bounded(self) -> int:
         """Components that have bounds, each with an arc code."""
-        return self.n_switching // 2 if self.curved else self.n_switching
+        return len({level.component for level in self.levels})
 
     def probe(self, one: Tensor) -> dict[str, Tensor]:
         """An admissible control with the batch shape of ``one`` (..., 1)."""
@@ -101,7 +128,10 @@ class ControlSet(Protocol):
 
     def arc_codes(self, switching: Tensor) -> Tensor:
         """Arc codes (..., m) that the minimum principle asks for, from the switching functions."""
-        ...
+        codes = torch.full((*switching.shape[:-1], self.n_bounded), LOWER, device=switching.device)
+        for level, above in zip(self.levels, (switching > 0).unbind(-1), strict=True):
+            codes[..., level.component] += (level.above - level.below) * above
+        return codes
 
     def samples(self, minimiser: Minimiser, p: Any) -> Minimiser:
         """Other admissible controls, and their η, on a new first axis: far from the given one and near it."""
@@ -112,15 +142,8 @@ class Unbounded(ControlSet, Protocol):
     """What sets without bounds share: there are no arcs."""
 
     @property
-    def n_switching(self) -> int:
-        return 0
-
-    @property
-    def curved(self) -> bool:
-        return False
+    def levels(self) -> tuple[Level, ...]:
+        return ()
 
     def penalty(self, minimiser: Minimiser, p: Any, smoothing: Tensor) -> Tensor:
         return torch.zeros_like(smoothing)
-
-    def arc_codes(self, switching: Tensor) -> Tensor:
-        return torch.zeros_like(switching, dtype=torch.long)

@@ -20,6 +20,7 @@ from ponn_torch.optimal_control.control_set import INTERIOR, LOWER, UPPER, Contr
 from ponn_torch.optimal_control.meaning import Keyed, meaning
 from ponn_torch.optimal_control.problem import Named, OptimalControlProblem, nearest
 
+LONGEST = 3  # of a chain on segments: its last entry is known to ε/h^(q−1), its rate to ε/h^q
 MASS_VARIABLES = ("auto", "mass", "log_mass", "delta_v")
 
 
@@ -241,8 +242,10 @@ def _single_chains(bvp: BoundaryValueProblem) -> tuple[Chain, ...]:
 def find_chains(bvp: BoundaryValueProblem, n_probes: int = 64) -> tuple[Chain, ...]:
     """Find F_i ≡ k w_j by evaluating F at random points, join them, and mark chains whose last rate is zero.
 
-    A chain has to hold in every setting: for all values of the parameters, and on every arc.
+    A chain has to hold in every setting: for all values of the parameters, and on every arc. Where there are arcs, and
+    with them short segments, a long one is cut in pieces.
     """
+    longest = LONGEST if bvp.law.n_switching else bvp.dimension
     t, w = probe_points(bvp, n_probes)
     settings = probe_settings(bvp, t)
     rates = torch.cat([bvp.rates(t, w, setting) for setting in settings])
@@ -265,8 +268,12 @@ def find_chains(bvp: BoundaryValueProblem, n_probes: int = 64) -> tuple[Chain, .
         used.add(i)
         while columns[-1] in follows and follows[columns[-1]][0] not in used:
             j, k = follows[columns[-1]]
-            columns.append(j)
-            factors.append(factors[-1] * k)
             used.add(j)
+            if len(columns) == longest:
+                out.append(Chain(tuple(columns), tuple(factors)))
+                columns, factors = [j], [1.0]
+            else:
+                columns.append(j)
+                factors.append(factors[-1] * k)
         out.append(Chain(tuple(columns), tuple(factors), bool(zero[columns[-1]])))
     return tuple(sorted(out, key=lambda chain: chain.columns))

@@ -140,12 +140,11 @@ class OptimalControlProblem:
         for name, value in self.parameters.items():
             if not finite(value):
                 raise ValueError(f"{self.name}: parameters[{name!r}] = {value!r}; a finite number is needed")
-        bounded = self.control if isinstance(self.control, Bounded) else None
-        for label in ("minimum", "maximum") if bounded is not None else ():
-            bound = getattr(bounded, label)
-            if isinstance(bound, str) and bound not in self.parameters:
-                hint = nearest(bound, ["a number", *self.parameters])
-                raise ValueError(f"{self.name}: {label} of the control = {bound!r}; {hint}")
+        for bounded in (part for part in self.control.factors if isinstance(part, Bounded)):
+            for label, bound in (("minimum", bounded.minimum), ("maximum", bounded.maximum)):
+                if isinstance(bound, str) and bound not in self.parameters:
+                    hint = nearest(bound, ["a number", *self.parameters])
+                    raise ValueError(f"{self.name}: {label} of the control = {bound!r}; {hint}")
         self._check_display()
         self._check_signatures()
         self._probe()

@@ -27,10 +27,10 @@ Along = Callable[[Tensor, Tensor], Tensor]  # (t, w) → (...,)
 
 
 def singular_components(law: ControlSet, arcs: Tensor | None) -> tuple[int, ...]:
-    """Components with an interior arc among codes (K, m), of a control that H is affine in."""
+    """Components with an interior arc among codes (K, m), of those that H is affine in."""
     if arcs is None or not law.jumps:
         return ()
-    return tuple((arcs == INTERIOR).any(0).nonzero()[:, 0].tolist())
+    return tuple(i for i in (arcs == INTERIOR).any(0).nonzero()[:, 0].tolist() if i in law.jumping)
 
 
 def singular_fractions(bvp: BoundaryValueProblem, t: Tensor, w: Tensor, setting: Setting) -> Tensor:
@@ -78,10 +78,10 @@ def _second_rate(
     interior = torch.full(arcs.shape, 0.5).to(w)
     interior[..., varied] = share
     held = replace(setting, regime=Regime(arcs=arcs, interior=interior))
-    free = replace(setting, regime=Regime())
+    free, function = replace(setting, regime=Regime()), bvp.law.jumping[component]
 
     def switching(t: Tensor, w: Tensor) -> Tensor:
-        return bvp.switching(t, w, free)[..., component]
+        return bvp.switching(t, w, free)[..., function]
 
     def rate(function: Along) -> Along:
         def along(t: Tensor, w: Tensor) -> Tensor:

@@ -15,6 +15,7 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from ponn_torch.optimal_control.control_laws import Bounded
+from ponn_torch.optimal_control.control_set import LOWER
 from ponn_torch.optimal_control.problem import DisplayUnit, Named
 from ponn_torch.reporting.diagnostics import convergence_figure, hamiltonian_figure, residual_figure
 from ponn_torch.reporting.style import (
@@ -80,9 +81,10 @@ def costates_figure(solution: Solution) -> Figure:
 # -- control ------------------------------------------------------------------------------------------------
 
 
-def _bounds(solution: Solution) -> tuple[float, ...]:
-    """Numerical bounds of the control set, in SI; () where it has none."""
-    law, double = solution.problem.control, torch.zeros((), dtype=torch.float64)
+def _bounds(solution: Solution, name: str) -> tuple[float, ...]:
+    """Numerical bounds of a control, in SI; () where it has none."""
+    law = next(part for part in solution.problem.control.factors if name in part.names)
+    double = torch.zeros((), dtype=torch.float64)
     if not isinstance(law, Bounded):
         return tuple(float(getattr(law, side)) for side in ("minimum", "maximum") if hasattr(law, side))
     found = law.bounds(Named(**solution.problem.parameters), double)
@@ -111,23 +113,23 @@ def _control_axis(solution: Solution, ax: Axes, t: Tensor, name: str, samples: S
     else:
         values = samples.control[name]
         _block(ax, t, values, shown, component_symbols(name, values.shape[-1]), tex)
-    for bound in _bounds(solution):
+    for bound in _bounds(solution, name):
         ax.axhline(bound / shown.size, color=GREY, lw=0.8, ls=":")
 
 
-def switching_labels(solution: Solution, n_switching: int) -> list[str]:
-    """S, or one label per function: S at both bounds where H is curved, one per component of a box."""
-    curved = solution.bvp.law.curved
-    size = n_switching // 2 if curved else n_switching
-    sides = (r"\min", r"\max") if curved else ("",)
-    numbers = [str(i + 1) for i in range(size)] if size > 1 else [""]
-    indices = [",".join(part for part in (side, number) if part) for side in sides for number in numbers]
-    return [f"$S_{{{index}}}$" if index else "$S$" for index in indices]
+def switching_labels(solution: Solution) -> list[str]:
+    """S, or one label per function: S at both bounds where H is convex, and the number of one of several components."""
+    law, labels = solution.bvp.law, []
+    for level in law.levels:
+        side = "" if level.jumps else r"\min" if level.below == LOWER else r"\max"
+        index = ",".join(part for part in (side, str(level.component + 1) if law.n_bounded > 1 else "") if part)
+        labels.append(f"$S_{{{index}}}$" if index else "$S$")
+    return labels
 
 
 def _switching_axis(solution: Solution, ax: Axes, t: Tensor, samples: Samples, *, legend: bool) -> None:
     n_switching = samples.switching.shape[-1]
-    labels = switching_labels(solution, n_switching)
+    labels = switching_labels(solution)
     colours = [PURPLE] if n_switching == 1 else [COMPONENTS[i % len(COMPONENTS)] for i in range(n_switching)]
     if solution.smoothing is not None:
         # inside the band |S| < ρ the smoothed control is in transition

@@ -186,7 +186,7 @@ def signs(solution: Solution, tolerance: float, n_points: int = 401) -> tuple[fl
     if arcs is None:
         return None, None
     options: dict[str, Any] = {"dtype": curve.xi.dtype, "device": curve.xi.device}
-    even = torch.linspace(-1.0, 1.0, n_points, **options)
+    levels, even = solution.bvp.law.levels, torch.linspace(-1.0, 1.0, n_points, **options)
     near = torch.logspace(-9, -2.3, 40, **options)
     fractions = torch.linspace(0.0, 1.0, 41, **options)
     grid = torch.cat([even, near - 1.0, 1.0 - near]).sort().values
@@ -201,7 +201,7 @@ def signs(solution: Solution, tolerance: float, n_points: int = 401) -> tuple[fl
 
         z = grid
         for _ in range(3):
-            depth = wrong_side(switching(z), codes)
+            depth = wrong_side(switching(z), codes, levels)
             deepest = max(deepest, _worst(depth.clamp_min(0.0)))
             # a local maximum between grid points may reach further: look there again, closer
             rise = (depth[1:-1] >= depth[:-2]) & (depth[1:-1] >= depth[2:])
@@ -210,7 +210,8 @@ def signs(solution: Solution, tolerance: float, n_points: int = 401) -> tuple[fl
                 break
             left, right = z[peaks - 1], z[peaks + 1]
             z = (left[:, None] + (right - left)[:, None] * fractions).flatten().unique()
-        if solution.bvp.law.jumps:  # an arc with S = 0 is singular, and has to be claimed as one
-            zero = (switching(even[1:-1]).abs() <= tolerance).double().mean(0)
-            share = max(share, float(torch.where(codes == INTERIOR, 0.0, zero).max()))
+        zero = (switching(even[1:-1]).abs() <= tolerance).double().mean(0)
+        for level, part in zip(levels, zero.tolist(), strict=True):
+            if level.jumps and codes[level.component] != INTERIOR:  # S = 0 is singular, and has to be claimed as that
+                share = max(share, part)
     return deepest, share

@@ -133,7 +133,7 @@ class Family:
             segment = torch.arange(made.n_segments, device=t.device).repeat_interleave(t.shape[-1])
             t, w = t.flatten(1), w.flatten(1, 2)
             switching = self._minimiser(t, w, None, segment).switching
-            wrong = wrong_side(switching, arcs[segment].repeat(len(self), 1))
+            wrong = wrong_side(switching, arcs[segment].repeat(len(self), 1), made.bvp.law.levels)
             return (wrong.clamp_min(0.0).view(len(self), -1).amax(-1),)
 
         return made.replayed(f"disagreement at {n_points}", depth, self.xi)[0]

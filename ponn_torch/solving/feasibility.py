@@ -95,10 +95,12 @@ def minimum_time_twin(problem: OptimalControlProblem) -> OptimalControlProblem:
     """The same dynamics, ends and controls, as fast as possible.
 
     Raises:
-        ValueError: a control without bounds, with which any time is long enough.
+        ValueError: a control without bounds, with which any time is long enough, or several controls.
     """
     if not isinstance(problem.control, Bounded):
-        raise ValueError(f"{problem.name}: its control has no bounds, so that there is no minimum time")
+        raise ValueError(
+            f"{problem.name}: its control is not one set with bounds, so that there may be no minimum time"
+        )
     time = problem.unit("time")
     return replace(
         problem,
@@ -123,11 +125,12 @@ def least_control_twin(problem: OptimalControlProblem) -> OptimalControlProblem:
     where an engine is a source of propellant, answers nothing.
 
     Raises:
-        ValueError: a control without bounds, or whose bounds exclude zero, so that they cannot shrink towards it.
+        ValueError: a control without bounds, or whose bounds exclude zero, so that they cannot shrink towards it; or
+            several controls.
     """
     law = problem.control
     if not isinstance(law, Bounded):
-        raise ValueError(f"{problem.name}: its control has no bounds, so that any amount of it is allowed")
+        raise ValueError(f"{problem.name}: its control is not one set with bounds, which could shrink")
     low, high = _bounds(problem)
     if not _include_zero(low, high):
         least, most = (", ".join(f"{value:g}" for value in bound.flatten().tolist()) for bound in (low, high))
@@ -209,7 +212,7 @@ def _control_strength(problem: OptimalControlProblem) -> float:
 def check_final_time(problem: OptimalControlProblem, solver: Solver, seed: int = 0) -> Feasibility | None:
     """Solve the minimum-time twin with the same solver; None where the question does not arise.
 
-    That is: a final time that is free, or a control without bounds.
+    That is: a final time that is free, or a control that is not one set with bounds.
     """
     if problem.free_final_time or not isinstance(problem.control, Bounded):
         return None
@@ -225,7 +228,7 @@ def check_final_time(problem: OptimalControlProblem, solver: Solver, seed: int =
 def check_control(problem: OptimalControlProblem, solver: Solver, seed: int = 0) -> ControlNeeded | None:
     """Solve the least-control twin with the same solver; None where the question does not arise.
 
-    That is: a final time that is free, or a control without bounds or whose bounds exclude zero.
+    That is: a final time that is free, or a control that is not one set with bounds, or whose bounds exclude zero.
     """
     law = problem.control
     if problem.free_final_time or not isinstance(law, Bounded):

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from ponn_torch.optimal_control.boundary_value_problem import BoundaryValueProblem, Setting
-from ponn_torch.optimal_control.control_set import INTERIOR, LOWER, UPPER, Regime
+from ponn_torch.optimal_control.control_set import INTERIOR, LOWER, UPPER, Level, Regime
 from ponn_torch.optimal_control.curve import Curve
 from ponn_torch.optimal_control.singular import clebsch, singular_components, singular_fractions
 from ponn_torch.solving.switching import (
@@ -33,9 +33,9 @@ NEARLY = 0.05  # of a control's range, by which it may leave that between two po
 
 
 class Stretch(NamedTuple):
-    """Scaled times between which S of a component cannot be told from zero."""
+    """Scaled times between which a switching function cannot be told from zero."""
 
-    component: int
+    function: int
     start: float
     end: float
 
@@ -48,9 +48,10 @@ def undecided(curve: Curve, smoothing: float) -> Stretch:
     """The longest stretch over which some |S| ≤ ρ; one without length if there is none."""
     t, w = grid(curve, max(50, 2000 // curve.collocation.n_segments))
     longest = Stretch(0, 0.0, 0.0)
-    for component, inside in enumerate((switching_along(curve, t, w).abs() <= smoothing).unbind(-1)):
-        for first, last in _runs(inside):
-            longest = max(longest, Stretch(component, float(t[first]), float(t[last])), key=lambda one: one.length)
+    small = (switching_along(curve, t, w).abs() <= smoothing).unbind(-1)
+    for function, (inside, level) in enumerate(zip(small, curve.collocation.bvp.law.levels, strict=True)):
+        for first, last in _runs(inside) if level.jumps else ():
+            longest = max(longest, Stretch(function, float(t[first]), float(t[last])), key=lambda one: one.length)
     return longest
 
 
@@ -63,7 +64,7 @@ def vanishing(rungs: Sequence[tuple[float, Stretch]]) -> Stretch | None:
         return None
     smoothing, last = rungs[-1]
     before = [stretch for value, stretch in rungs if value >= 8 * smoothing]
-    if not before or last.component != before[-1].component or last.length < 0.6 * before[-1].length:
+    if not before or last.function != before[-1].function or last.length < 0.6 * before[-1].length:
         return None
     return last if last.length > 0 else None
 
@@ -78,18 +79,19 @@ def _runs(inside: Tensor) -> list[tuple[int, int]]:
 # -- structures ----------------------------------------------------------------------------------------------------
 
 
-def with_arc(structure: Structure, ends: Tensor, stretch: Stretch, code: int) -> Structure:
+def with_arc(structure: Structure, ends: Tensor, stretch: Stretch, code: int, levels: Sequence[Level]) -> Structure:
     """The same arcs, but that of one component is another on a stretch, and its S vanishes where that begins and ends.
 
     ``ends`` are the scaled times at which the whole begins and ends.
     """
-    component, start, end = stretch
+    function, start, end = stretch
+    component = levels[function].component
     inside = (structure.times >= start) & (structure.times <= end)
     switches = [
-        (time, tuple(e for e in events if not (gone and e == component)))
+        (time, tuple(e for e in events if not (gone and e == function)))
         for time, events, gone in zip(structure.times.tolist(), structure.events, inside.tolist(), strict=True)
     ]
-    switches += [(time, (component,)) for time in (start, end) if float(ends[0]) < time < float(ends[-1])]
+    switches += [(time, (function,)) for time in (start, end) if float(ends[0]) < time < float(ends[-1])]
     switches = sorted((time, events) for time, events in switches if events)
     times = ends.new_tensor([time for time, _ in switches])
     knots = torch.cat([ends[:1], times, ends[-1:]])
@@ -101,7 +103,7 @@ def with_arc(structure: Structure, ends: Tensor, stretch: Stretch, code: int) ->
 
 def on_stretch(curve: Curve, stretch: Stretch) -> Structure:
     """The arcs that S of a smoothed curve asks for, with a singular one where S is zero."""
-    return with_arc(find_structure(curve), curve.times, stretch, INTERIOR)
+    return with_arc(find_structure(curve), curve.times, stretch, INTERIOR, curve.collocation.bvp.law.levels)
 
 
 def at_turned_switches(curve: Curve, tolerance: float) -> Structure | None:
@@ -113,16 +115,17 @@ def at_turned_switches(curve: Curve, tolerance: float) -> Structure | None:
         return None
     claimed = claimed_structure(curve)
     t, w, arc = along_arcs(curve)
-    depth = wrong_side(switching_along(curve, t, w), claimed.arcs[arc])
+    levels = curve.collocation.bvp.law.levels
+    depth = wrong_side(switching_along(curve, t, w), claimed.arcs[arc], levels)
     found = claimed
     for time, events in zip(claimed.times.tolist(), claimed.events, strict=True):
         before, after = int((t < time).sum()), int((t <= time).sum())
-        for event in events:
+        for event in (e for e in events if levels[e].jumps):
             wrong = (depth[:, event] > tolerance).long()
             left, right = int(wrong[:before].flip(0).cumprod(0).sum()), int(wrong[after:].cumprod(0).sum())
             if left and right:
                 turned = Stretch(event, float(t[before - left]), float(t[after + right - 1]))
-                found = with_arc(found, curve.times, turned, INTERIOR)
+                found = with_arc(found, curve.times, turned, INTERIOR, levels)
     return found if found is not claimed and _plausible(curve, found) else None
 
 
@@ -140,15 +143,15 @@ def at_bounds(curve: Curve, tolerance: float) -> Structure | None:
     if not curve.collocation.bvp.singular:
         return None
     t, w, arc = along_arcs(curve)
-    codes = claimed.arcs[arc]
+    codes, law = claimed.arcs[arc], curve.collocation.bvp.law
     fractions = _fractions(curve, t, w, codes)
     for component in curve.collocation.bvp.singular:
         eta, on = fractions[:, component], codes[:, component] == INTERIOR
         for code, past in ((LOWER, -eta), (UPPER, eta - 1.0)):
             for first, last in _runs(on & (past > tolerance)):
                 if last > first:
-                    stretch = Stretch(component, float(t[first]), float(t[last]))
-                    found = with_arc(found, curve.times, stretch, code)
+                    stretch = Stretch(law.jumping[component], float(t[first]), float(t[last]))
+                    found = with_arc(found, curve.times, stretch, code, law.levels)
     return None if found is claimed else found
 
 

@@ -118,8 +118,8 @@ class Solution:
         if codes is None:
             return []
         rows = codes[[segments.start for segments in self.arc_segments]].tolist()
-        labels = SINGULAR_LABELS if self.bvp.law.jumps else ARC_LABELS
-        return [",".join(labels[code] for code in row) for row in rows]
+        labels = [SINGULAR_LABELS if i in self.bvp.law.jumping else ARC_LABELS for i in range(codes.shape[-1])]
+        return [",".join(names[code] for names, code in zip(labels, row, strict=True)) for row in rows]
 
     @property
     def arc_segments(self) -> list[range]:

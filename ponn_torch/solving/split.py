@@ -231,7 +231,9 @@ class Split(Segmentation, Refinement):
         """
         found = claimed_structure(curve)
         ends = torch.cat([curve.times[:1], found.times, curve.times[-1:]])
-        merged = without_short_arcs(found, ends, COLLAPSED if solved else self.short_arc)
+        merged = without_short_arcs(
+            found, ends, COLLAPSED if solved else self.short_arc, curve.collocation.bvp.law.levels
+        )
         if len(merged) < len(found):
             return [merged]
         if not solved:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache, partial
 from itertools import pairwise
@@ -10,7 +11,7 @@ import torch
 from torch import Tensor
 
 from ponn_torch.optimal_control.boundary_value_problem import Setting
-from ponn_torch.optimal_control.control_set import INTERIOR, LOWER, UPPER, Regime
+from ponn_torch.optimal_control.control_set import Level, Regime
 from ponn_torch.optimal_control.curve import Curve
 
 
@@ -102,9 +103,10 @@ def find_structure(curve: Curve, blunter: Curve | None = None, *, n_points: int 
     root, event = root[order], event[order]
     ends = torch.cat([curve.times[:1], root, curve.times[-1:]])
     middle = 0.5 * (ends[1:] + ends[:-1])
-    arcs = curve.collocation.bvp.law.arc_codes(switching(middle))
+    law = curve.collocation.bvp.law
+    arcs = law.arc_codes(switching(middle))
     # S = 0 at an end of the time, or two S at once, up to round-off of either sign, would open an arc without duration
-    return without_short_arcs(Structure(arcs, root, tuple((e,) for e in event.tolist())), ends, 1e-12)
+    return without_short_arcs(Structure(arcs, root, tuple((e,) for e in event.tolist())), ends, 1e-12, law.levels)
 
 
 def _linear(t: Tensor, values: Tensor, at: Tensor) -> Tensor:
@@ -114,11 +116,12 @@ def _linear(t: Tensor, values: Tensor, at: Tensor) -> Tensor:
     return torch.lerp(values[after - 1], values[after], share[:, None])
 
 
-def without_short_arcs(structure: Structure, knot_times: Tensor, fraction: float) -> Structure:
+def without_short_arcs(structure: Structure, knot_times: Tensor, fraction: float, levels: Sequence[Level]) -> Structure:
     """Merge away arcs shorter than ``fraction`` of the whole; neighbours that then agree become one arc.
 
     Where they differ in several components, these switch together.
     """
+    first = {level.component: function for function, level in reversed(list(enumerate(levels)))}
     durations = knot_times[1:] - knot_times[:-1]
     keep = (durations > fraction * (knot_times[-1] - knot_times[0])).nonzero()[:, 0].tolist()
     if not keep:
@@ -130,9 +133,9 @@ def without_short_arcs(structure: Structure, knot_times: Tensor, fraction: float
         # the arcs between the two are gone: one switch in the middle of where they were
         times.append(0.5 * (knot_times[before + 1] + knot_times[after]))
         # of the functions of a component that vanished there, the last one
-        gone = {e % len(arcs[-1]): e for event in structure.events[before:after] for e in event}
+        gone = {levels[e].component: e for event in structure.events[before:after] for e in event}
         changed = (structure.arcs[after] != arcs[-1]).nonzero()[:, 0].tolist()
-        events.append(tuple(gone.get(component, component) for component in changed))
+        events.append(tuple(gone.get(i, first[i]) for i in changed))
         arcs.append(structure.arcs[after])
     merged = torch.stack(times) if times else structure.times[:0]
     return Structure(torch.stack(arcs), merged, tuple(events))
@@ -141,16 +144,15 @@ def without_short_arcs(structure: Structure, knot_times: Tensor, fraction: float
 # -- repair ------------------------------------------------------------------------------------------------------------
 
 
-def wrong_side(switching: Tensor, codes: Tensor) -> Tensor:
-    """How far every S (m, n_switching) is on the side that its arc's codes (m, k) exclude; negative on the right one.
+def wrong_side(switching: Tensor, codes: Tensor, levels: Sequence[Level]) -> Tensor:
+    """How far every S (..., n_switching) is on the side that its arc's codes (..., k) exclude; negative on the right.
 
-    On a singular arc both sides are wrong. A convex H has one S at each bound: the control is off the lower bound where
-    the first is positive, and at the upper where the second is.
+    On a singular arc both sides are wrong: its code is neither above nor below.
     """
-    affine = switching.shape[-1] == codes.shape[-1]
-    claimed = codes == UPPER if affine else torch.cat([codes >= INTERIOR, codes >= UPPER], -1)
-    depth = torch.where(claimed, -switching, switching)
-    return torch.where(codes == INTERIOR, switching.abs(), depth) if affine else depth
+    components, below, above = (codes.new_tensor(column) for column in zip(*levels, strict=True))
+    claimed = codes.expand(*switching.shape[:-1], -1).index_select(-1, components)
+    depth = torch.where(claimed >= above, -switching, switching)
+    return torch.where((claimed > below) & (claimed < above), switching.abs(), depth)
 
 
 def along_arcs(curve: Curve) -> tuple[Tensor, Tensor, Tensor]:
@@ -173,11 +175,11 @@ def needles(curve: Curve, width: float, tolerance: float) -> list[Structure]:
     claimed = claimed_structure(curve)
     if curve.collocation.setting.regime.arcs is None:
         return []
-    arcs, events = claimed.arcs, claimed.events
+    arcs, events, levels = claimed.arcs, claimed.events, curve.collocation.bvp.law.levels
     ends = torch.cat([curve.times[:1], claimed.times, curve.times[-1:]])
     t, w, arc = along_arcs(curve)
     switching = switching_along(curve, t, w)
-    depth = wrong_side(switching, arcs[arc])
+    depth = wrong_side(switching, arcs[arc], levels)
     found: list[tuple[float, Structure]] = []
     for event, column in enumerate(depth.unbind(-1)):
         # runs of points on the wrong side, cut where an arc ends
@@ -190,7 +192,8 @@ def needles(curve: Curve, width: float, tolerance: float) -> list[Structure]:
             length = min(width * float(ends[-1] - ends[0]), 0.3 * float(ends[k + 1] - ends[k]))
             middle = float(t[peak].clamp(ends[k] + length, ends[k + 1] - length))
             new = [middle - 0.5 * length, middle + 0.5 * length]
-            needle = _other_side(arcs[k], event, depth.shape[-1], bool(switching[peak, event] > 0))
+            needle = arcs[k].clone()
+            needle[levels[event].component] = levels[event].above if switching[peak, event] > 0 else levels[event].below
             pieces = [arcs[: k + 1], needle[None], arcs[k:]]
             if int(points[-1]) == len(run) - 1:
                 new, pieces = [float(ends[-1]) - length], pieces[:2]
@@ -200,13 +203,3 @@ def needles(curve: Curve, width: float, tolerance: float) -> list[Structure]:
             what = (*events[:k], *[(event,)] * len(new), *events[k:])
             found.append((float(column[peak]), Structure(torch.cat(pieces), switches, what)))
     return [structure for _, structure in sorted(found, key=lambda pair: -pair[0])]
-
-
-def _other_side(codes: Tensor, event: int, n_switching: int, above: bool) -> Tensor:
-    """Arc codes (k,) with the component of one switching function moved to the side where that is, ``above`` zero."""
-    levels = (LOWER, UPPER) if n_switching == len(codes) else (LOWER, INTERIOR, UPPER)
-    component, level = event % len(codes), event // len(codes)
-    low, high = levels[level], levels[level + 1]
-    changed = codes.clone()
-    changed[component] = high if above else low
-    return changed

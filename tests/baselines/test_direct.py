@@ -12,13 +12,14 @@ import torch
 from ponn_torch.baselines.controls import control_variables
 from ponn_torch.baselines.direct import TwoStage, Unstructured
 from ponn_torch.baselines.transcription import Phase, Program, RadauRule
-from ponn_torch.optimal_control.control_set import LOWER, UPPER
+from ponn_torch.optimal_control.control_set import LOWER, UPPER, ControlSet
 from ponn_torch.optimal_control.problem import OptimalControlProblem
 from ponn_torch.problems.constants import DAY
 from ponn_torch.problems.double_integrator import minimum_energy, minimum_fuel, minimum_time
 from ponn_torch.problems.earth_mars import earth_mars
 from ponn_torch.problems.energy_transfer import energy_transfer, energy_transfer_limited
 from ponn_torch.problems.mars_landing import mars_landing
+from ponn_torch.problems.planar_car import planar_car
 from ponn_torch.solving.certificate import certify
 from ponn_torch.solving.paths import PolarTransfer
 from ponn_torch.solving.solution import Solution
@@ -39,9 +40,15 @@ def tfc_test_2() -> OptimalControlProblem:
     return mars_landing(initial_velocity=(85.0, 50.0, -65.0), mass_flow_per_thrust=5.0863e-4, free_final_time=True)
 
 
+def bounded_car() -> OptimalControlProblem:
+    return planar_car(maximum_turn=2.0, known_cost=3.801260863077)
+
+
 # problem → arcs, switch times (s) and final time (s)
 BANG_BANG: dict[Callable[[], OptimalControlProblem], tuple[list[str], list[float], float]] = {
     minimum_time: (["max", "min"], [1.0], 2.0),
+    planar_car: (["max", "min"], [1.7176930388739], 3.4353860777478),
+    bounded_car: (["max,interior", "min,interior"], [1.7176930388739], 3.4353860777478),
     minimum_fuel: (["max", "min", "max"], [1.5 - 1.25**0.5, 1.5 + 1.25**0.5], 3.0),
     mars_landing: (["max", "min", "max"], [31.0920056478, 39.2202817443], 44.823),
     tfc_test_1: (["min", "max"], [7.4430057683], 31.2623123369),
@@ -133,7 +140,9 @@ def test_the_radau_rule_is_exact_for_polynomials(degree: int) -> None:
     np.testing.assert_allclose(rule.derivative @ support**degree, expected, atol=1e-10)
 
 
-@pytest.mark.parametrize("make", [mars_landing, minimum_time, energy_transfer], ids=lambda m: m.__name__)
+@pytest.mark.parametrize(
+    "make", [mars_landing, minimum_time, energy_transfer, planar_car, bounded_car], ids=lambda m: m.__name__
+)
 def test_control_variables_and_controls_are_inverse(make: Callable[[], OptimalControlProblem]) -> None:
     problem = make()
     variables = control_variables(problem, 0.0)
@@ -147,12 +156,15 @@ def test_a_control_set_of_another_kind_is_named() -> None:
         Program(problem, (Phase(3),), 2).build()
 
 
-class _Strange:
+class _Strange(ControlSet):
     """A control set that only knows what a problem's probe asks."""
 
     def __init__(self, name: str, size: int) -> None:
         self.name, self.size = name, size
-        self.names = {name: size}
+
+    @property
+    def names(self) -> dict[str, int]:
+        return {self.name: self.size}
 
     def probe(self, one: torch.Tensor) -> dict[str, torch.Tensor]:
         return {self.name: one.expand(*one.shape[:-1], self.size)}

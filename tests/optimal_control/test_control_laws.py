@@ -208,7 +208,7 @@ def throttle_energy(primer: Tensor, curvature: float = 0.5):
 def test_a_convex_hamiltonian_is_minimised_by_clipping(size, minimum):
     h = throttle_energy(tensor([[0.0, size, 0.0]]))
     law = adapted(ThrustBall("thrust", 2.0, minimum), h, cost_rate=None)
-    assert law.curved
+    assert law.convex == (0,)
     assert law.n_switching == 2
     best = law.minimise(h, NONE, column(1.0), Regime())
     assert float(best.control["thrust_magnitude"]) == pytest.approx(min(max(size / 0.5, minimum), 2.0), rel=1e-12)
@@ -317,7 +317,7 @@ def test_every_component_of_a_box_minimises_its_part(regulariser, slopes, seed):
     law = Box("u", 2.0, -1.0, 3, regulariser=make_regulariser(regulariser))
     law = adapted(law, affine(tensor([1.0, 2.0, 3.0])), None)
     best = law.minimise(h, NONE, column(1.0), Regime(smoothing=rho))
-    assert not law.curved
+    assert law.convex == ()
     assert law.cost_rate == pytest.approx(1 / 3)  # the scale of H over the range
     torch.testing.assert_close(best.switching, -tensor([slopes]) / law.cost_rate, rtol=1e-14, atol=1e-14)
     fractions = 1e-9 + (1 - 2e-9) * random(400, 3, seed=seed)
@@ -331,7 +331,7 @@ def test_a_convex_box_is_clipped_component_by_component(slopes):
     curvatures = tensor([1.0, 4.0])
     h = separable(tensor([slopes]), curvatures)
     law = adapted(Box("u", 1.0, -0.5, size=2), separable(ONE * tensor([1.0, 1.0]), curvatures), None)
-    assert law.curved
+    assert law.convex == (0, 1)
     assert law.n_switching == 4
     best = law.minimise(h, NONE, column(1.0), Regime())
     expected = (-tensor([slopes]) / curvatures).clamp(-0.5, 1.0)
@@ -386,17 +386,43 @@ def test_a_box_needs_a_hamiltonian_up_to_squares(part):
         adapted(Box("u", 4.0, -4.0, 2), h, None)
 
 
+@pytest.mark.parametrize("regulariser", REGULARISERS)
+@given(slopes=st.lists(st.floats(-3, 3), min_size=3, max_size=3), seed=st.integers(0, 1000))
+def test_a_box_may_be_affine_in_one_component_and_convex_in_another(regulariser, slopes, seed):
+    curvatures = tensor([0.0, 2.0, 0.0])
+    h, rho = separable(tensor([slopes]), curvatures), column(0.3)
+    law = Box("u", (1.0, 2.0, 3.0), -1.0, 3, regulariser=make_regulariser(regulariser))
+    law = adapted(law, separable(ONE * tensor([1.0, 2.0, 3.0]), curvatures), None)
+    assert law.convex == (1,)
+    assert [tuple(level) for level in law.levels] == [
+        (0, LOWER, UPPER),
+        (1, LOWER, INTERIOR),
+        (2, LOWER, UPPER),
+        (1, INTERIOR, UPPER),
+    ]
+    best = law.minimise(h, NONE, column(1.0), Regime(smoothing=rho))
+    fractions = 1e-9 + (1 - 2e-9) * random(400, 3, seed=seed)
+    other = Minimiser({"u": -1 + tensor([2.0, 3.0, 4.0]) * fractions}, fractions, fractions)
+    values = h(**other.control) + law.penalty(other, NONE, rho)
+    assert regularised(law, h, rho, best) <= float(values.min()) + 1e-12
+    # without smoothing the codes say where it is
+    sharp = law.minimise(h, NONE, column(1.0), Regime())
+    pinned = law.minimise(h, NONE, column(1.0), Regime(arcs=law.arc_codes(sharp.switching)))
+    torch.testing.assert_close(pinned.control["u"], sharp.control["u"], rtol=1e-12, atol=1e-12)
+    assert float(sharp.control["u"][0, 1]) == pytest.approx(min(max(-slopes[1] / 2.0, -1.0), 2.0), abs=1e-12)
+
+
 def test_curvature_that_turns_with_the_costate_is_concave_somewhere():
     costates = tensor([[0.4], [1.0], [-0.4], [-1.0]])  # two and their opposites
     with pytest.raises(ValueError, match=r"u: the Hamiltonian is concave in component 0; .*Stationary"):
         adapted(Box("u", 1.0, -1.0), lambda u: costates * (u + 0.25 * u**2), None)
     # a running cost that outweighs a small costate decides
-    assert adapted(Box("u", 1.0, -1.0), lambda u: costates * (u + 0.25 * u**2) + 0.2 * u**2, None).curved
+    assert adapted(Box("u", 1.0, -1.0), lambda u: costates * (u + 0.25 * u**2) + 0.2 * u**2, None).convex
 
 
 def test_curvature_that_turns_with_the_state_is_left_to_the_certificate():
     masses = tensor([[1.0], [-1.0], [1.0], [-1.0]])
-    assert adapted(Box("u", 1.0, -1.0), lambda u: masses * u**2 + u, None).curved
+    assert adapted(Box("u", 1.0, -1.0), lambda u: masses * u**2 + u, None).convex
 
 
 def test_impossible_box_bounds_are_named():

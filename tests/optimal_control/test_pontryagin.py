@@ -214,6 +214,19 @@ def free_flying_robot(x, c) -> Rates:
     }
 
 
+def planar_car(x, c) -> Rates:
+    ahead = torch.cat([torch.cos(x.heading), torch.sin(x.heading)], -1)
+    across = torch.cat([-ahead[..., 1:], ahead[..., :1]], -1)
+    return {
+        "r": x.speed * ahead,
+        "heading": -c.heading,
+        "speed": torch.tanh(-2 * c.speed / RHO),
+        "lambda_r": torch.zeros_like(c.r),
+        "lambda_heading": -x.speed * dot(c.r, across),
+        "lambda_speed": -dot(c.r, ahead),
+    }
+
+
 CANTED = 1 / (225.0 * G0 * math.cos(math.radians(27.0)))
 BY_HAND: dict[str, Callable[..., Rates]] = {
     "boundary_layer": boundary_layer,
@@ -234,6 +247,7 @@ BY_HAND: dict[str, Callable[..., Rates]] = {
     "mars_landing": landing(CANTED),
     "orbit_raising": orbit_raising,
     "oscillator": oscillator,
+    "planar_car": planar_car,
     "small_body_landing": small_body(linearised_gravity),
     "zermelo": zermelo,
     "tfc_test_1": landing(5.0863e-4),

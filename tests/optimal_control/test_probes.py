@@ -45,13 +45,6 @@ def test_a_control_saturated_at_all_probes_is_still_seen(regulariser):
     assert bvp.couplings[1].tolist() == [False, False, False, True]
 
 
-def test_a_box_refuses_a_hamiltonian_affine_in_one_component_and_convex_in_another():
-    cost = lambda t, x, u, p: u.u[..., :1] ** 2 + u.u[..., 1:]  # noqa: E731
-    dynamics = lambda t, x, u, p: {"x": u.u[..., :1], "v": u.u[..., 1:]}  # noqa: E731
-    with pytest.raises(ValueError, match="affine in component 1 and curved in component 0"):
-        pontryagin(cart(control=Box("u", 1.0, -1.0, size=2), dynamics=dynamics, running_cost=cost))
-
-
 def names_of(bvp):
     """Entries of w by name; L stands for lambda_."""
     states = bvp.problem.component_names
@@ -134,7 +127,7 @@ def test_a_steering_angle_may_have_its_minimum_at_any_sign_of_the_costates(low, 
         (lambda t, x, u, p: {"x": x.v, "v": u.u - 0.3 * torch.abs(u.u)}, "neither affine nor quadratic"),
     ],
 )
-def test_a_box_refuses_dynamics_curved_in_the_control(dynamics, end):
+def test_a_box_refuses_dynamics_that_bend_in_the_control(dynamics, end):
     with pytest.raises(ValueError, match=f"u: the Hamiltonian is {end}.*Stationary"):
         pontryagin(
             cart(control=Box("u", 1.0, -1.0), dynamics=dynamics, running_cost=lambda t, x, u, p: torch.ones_like(t))

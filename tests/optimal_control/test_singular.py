@@ -44,7 +44,7 @@ def points(bvp: BoundaryValueProblem, count: int = 20) -> tuple[Tensor, Tensor]:
 def test_components_with_interior_arcs_are_singular_where_h_is_affine():
     codes = torch.tensor([[LOWER, INTERIOR], [UPPER, LOWER]])
     assert singular_components(Box("u", 1.0, size=2), codes) == (1,)
-    assert singular_components(Box("u", 1.0, size=2, curved=True), codes) == ()
+    assert singular_components(Box("u", 1.0, size=2, convex=(0, 1)), codes) == ()
     assert singular_components(Box("u", 1.0, size=2), None) == ()
 
 

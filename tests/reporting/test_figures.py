@@ -172,7 +172,7 @@ def test_without_smoothing_the_stage_before_a_split_is_told_apart_from_it():
 def test_switching_functions_are_told_apart(solved, kind, count, labels):
     solution = solved(kind).solution
     assert solution.sample(5).switching.shape[-1] == count
-    assert switching_labels(solution, count) == labels
+    assert switching_labels(solution) == labels
 
 
 def test_symbols():

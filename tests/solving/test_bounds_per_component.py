@@ -59,7 +59,7 @@ def test_it_is_solved_as_in_other_units(energy):
     low, high = (torch.tensor(bound, dtype=torch.float64) for bound in (LOW, HIGH))
     assert bool(((low - 1e-9 <= force) & (force <= high + 1e-9)).all())
     assert float(force[:, 0].min()) == pytest.approx(-0.8, abs=1e-9)
-    assert _bounds(found) == (-0.8, -1.5, 1.0, 1.5)
+    assert _bounds(found, "force") == (-0.8, -1.5, 1.0, 1.5)
     assert "control" in all_figures(found)
 
 

@@ -80,4 +80,4 @@ def test_an_interval_that_does_not_shrink_is_singular(power, singular):
     assert (found == rungs[-1][1]) if singular else (found is None)
     assert vanishing(rungs[:2]) is None  # too few to tell
     assert vanishing([]) is None
-    assert vanishing([*rungs[:-1], (0.00625, rungs[-1][1]._replace(component=1))]) is None
+    assert vanishing([*rungs[:-1], (0.00625, rungs[-1][1]._replace(function=1))]) is None

@@ -31,6 +31,7 @@ from ponn_torch.solving.solver import Solver
 from ponn_torch.solving.split import Split
 from ponn_torch.solving.switching import Structure, needles, switching_along
 
+TWO = Box("u", 1.0, size=2).levels
 BOTH_ENDS = torch.tensor([0.0, 4.0], dtype=torch.float64)
 
 
@@ -76,7 +77,9 @@ def structure(codes: list[list[int]], times: list[float], events: list[tuple[int
     ],
 )
 def test_an_arc_is_put_in(stretch, codes, times, events):
-    found = with_arc(structure([[UPPER], [LOWER]], [1.0], [(0,)]), BOTH_ENDS, Stretch(0, *stretch), INTERIOR)
+    found = with_arc(
+        structure([[UPPER], [LOWER]], [1.0], [(0,)]), BOTH_ENDS, Stretch(0, *stretch), INTERIOR, Box("u", 1.0).levels
+    )
     assert found.arcs.flatten().tolist() == codes
     assert found.times.tolist() == times
     assert list(found.events) == events
@@ -84,12 +87,12 @@ def test_an_arc_is_put_in(stretch, codes, times, events):
 
 def test_switches_of_other_components_stay():
     given = structure([[UPPER, LOWER], [UPPER, UPPER], [LOWER, UPPER]], [1.0, 2.0], [(1,), (0,)])
-    found = with_arc(given, BOTH_ENDS, Stretch(0, 0.5, 2.5), INTERIOR)
+    found = with_arc(given, BOTH_ENDS, Stretch(0, 0.5, 2.5), INTERIOR, TWO)
     assert found.arcs.tolist() == [[UPPER, LOWER], [INTERIOR, LOWER], [INTERIOR, UPPER], [LOWER, UPPER]]
     assert found.times.tolist() == [0.5, 1.0, 2.5]
     assert found.events == ((0,), (1,), (0,))
     together = structure([[UPPER, LOWER], [LOWER, UPPER]], [1.0], [(0, 1)])
-    assert with_arc(together, BOTH_ENDS, Stretch(0, 0.5, 2.5), INTERIOR).events == ((0,), (1,), (0,))
+    assert with_arc(together, BOTH_ENDS, Stretch(0, 0.5, 2.5), INTERIOR, TWO).events == ((0,), (1,), (0,))
 
 
 @pytest.mark.parametrize(

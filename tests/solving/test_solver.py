@@ -113,6 +113,9 @@ ANSWERS = {
         ),
         1e-9,
     ),
+    "planar_car": Answer(
+        3.801260863077, 1e-11, ("max", "min"), (1.7176930388739,), 1e-10, 3.4353860777478, hamiltonian=0.0
+    ),
     "zermelo": Answer(5.457865263560512, 1e-12, final_time=5.457865263560512, hamiltonian=0.0),
     "earth_mars": Answer(
         396.05984393,

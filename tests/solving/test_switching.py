@@ -15,7 +15,7 @@ from ponn_torch.ansatz.basis import Chebyshev
 from ponn_torch.numerics.nodes import make_nodes
 from ponn_torch.optimal_control.collocation import Collocation
 from ponn_torch.optimal_control.control_laws import Box
-from ponn_torch.optimal_control.control_set import INTERIOR, LOWER, UPPER, Regime
+from ponn_torch.optimal_control.control_set import INTERIOR, LOWER, UPPER, Level, Regime
 from ponn_torch.optimal_control.curve import Curve
 from ponn_torch.optimal_control.discretisation import Discretisation
 from ponn_torch.optimal_control.pontryagin import pontryagin
@@ -170,6 +170,9 @@ def test_components_of_a_convex_box_switch_one_by_one():
 # -- short arcs ----------------------------------------------------------------------------------------------
 
 
+LEVELS = (Level(0, LOWER, UPPER),) * 3  # of one component, told apart by their number
+
+
 def structure_of(codes: list[int], switches: list[float]) -> Structure:
     times = torch.tensor(switches, dtype=torch.float64)
     return Structure(torch.tensor(codes)[:, None], times, tuple((i,) for i in range(len(switches))))
@@ -190,7 +193,7 @@ SHORT = [
 @pytest.mark.parametrize(("codes", "knots", "left", "switches", "events"), SHORT)
 def test_short_arcs_are_merged_away(codes, knots, left, switches, events):
     times = torch.tensor(knots, dtype=torch.float64)
-    merged = without_short_arcs(structure_of(codes, knots[1:-1]), times, 0.01)
+    merged = without_short_arcs(structure_of(codes, knots[1:-1]), times, 0.01, LEVELS)
     assert merged.arcs.flatten().tolist() == left
     assert merged.times.tolist() == pytest.approx(switches)
     assert merged.events == tuple((event,) for event in events)
@@ -199,7 +202,10 @@ def test_short_arcs_are_merged_away(codes, knots, left, switches, events):
 def test_components_whose_arcs_vanish_between_them_switch_together():
     codes, times = [[2, 2, 0], [0, 2, 0], [0, 0, 0]], torch.tensor([0.5, 0.501], dtype=torch.float64)
     merged = without_short_arcs(
-        Structure(torch.tensor(codes), times, ((0,), (1,))), torch.tensor([0.0, *times, 1.0]), 0.01
+        Structure(torch.tensor(codes), times, ((0,), (1,))),
+        torch.tensor([0.0, *times, 1.0]),
+        0.01,
+        Box("u", 1.0, size=3).levels,
     )
     assert merged.arcs.tolist() == [[2, 2, 0], [0, 0, 0]]
     assert merged.times.tolist() == pytest.approx([0.5005])
@@ -208,7 +214,7 @@ def test_components_whose_arcs_vanish_between_them_switch_together():
 
 def test_when_all_are_short_the_longest_stays():
     times = torch.tensor([0.0, 0.2, 0.5, 0.7, 1.0], dtype=torch.float64)
-    merged = without_short_arcs(structure_of([2, 0, 2, 0], [0.2, 0.5, 0.7]), times, 0.9)
+    merged = without_short_arcs(structure_of([2, 0, 2, 0], [0.2, 0.5, 0.7]), times, 0.9, LEVELS)
     assert len(merged) == 1
 
 
@@ -262,5 +268,9 @@ def test_the_wrong_side_of_a_convex_component_is_told_at_both_bounds():
     # S at the lower and at the upper bound: below both, between, above both
     switching = torch.tensor([[-1.0, -3.0], [1.0, -1.0], [3.0, 1.0]])
     for row, code in enumerate((LOWER, INTERIOR, UPPER)):
-        worst = [float(wrong_side(switching, torch.full((3, 1), c)).amax(-1)[row]) for c in (LOWER, INTERIOR, UPPER)]
+        depths = [
+            wrong_side(switching, torch.full((3, 1), c), Box("u", 1.0, convex=(0,)).levels)
+            for c in (LOWER, INTERIOR, UPPER)
+        ]
+        worst = [float(depth.amax(-1)[row]) for depth in depths]
         assert [value <= 0 for value in worst] == [c == code for c in (LOWER, INTERIOR, UPPER)]

@@ -1,0 +1,141 @@
+"""Several controls at once, each from a set of its own kind: a thrust and a turning rate, say.
+
+The Hamiltonian has to be a sum of what it says of each, so that each is minimised alone, whatever the others are.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import accumulate, combinations, pairwise
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from ponn_torch.optimal_control.control_set import ControlSet, Hamiltonian, Level, Minimiser, Regime
+
+ELSEWHERE = 0.6  # of a probe, a second one
+ROUNDING = 1e-9  # of H
+
+
+@dataclass(frozen=True)
+class Product(ControlSet):
+    """The Cartesian product of control sets; dynamics read the controls of all by their names.
+
+    Raises:
+        ValueError: no set, or two that have a control of the same name.
+    """
+
+    sets: Sequence[ControlSet]
+
+    def __post_init__(self) -> None:
+        if not self.sets:
+            raise ValueError("sets: none given; allowed: at least one control set")
+        object.__setattr__(self, "sets", tuple(self.sets))
+        twice = [
+            name for name, count in Counter(name for part in self.sets for name in part.names).items() if count > 1
+        ]
+        if twice:
+            raise ValueError(f"sets: several controls are called {twice[0]!r}; allowed: a name for each")
+
+    @property
+    def factors(self) -> Sequence[ControlSet]:
+        return self.sets
+
+    @property
+    def names(self) -> dict[str, int]:
+        return {name: size for part in self.sets for name, size in part.names.items()}
+
+    @property
+    def levels(self) -> tuple[Level, ...]:
+        return tuple(
+            level._replace(component=level.component + components.start)
+            for part, components in zip(self.sets, self._components, strict=True)
+            for level in part.levels
+        )
+
+    @property
+    def _components(self) -> list[slice]:
+        """Where the components of each part stand among those of all."""
+        return _slices([part.n_bounded for part in self.sets])
+
+    @property
+    def _functions(self) -> list[slice]:
+        """Where the switching functions of each part stand."""
+        return _slices([part.n_switching for part in self.sets])
+
+    def probe(self, one: Tensor) -> dict[str, Tensor]:
+        return {name: value for part in self.sets for name, value in part.probe(one).items()}
+
+    @torch.no_grad()
+    def adapted(self, h: Hamiltonian, cost: Hamiltonian, p: Any, one: Tensor, unit: float) -> Product:
+        probe = self.probe(one)
+        for first, second in combinations(self.sets, 2):
+            moved = [part.probe(ELSEWHERE * one) for part in (first, second)]
+            corners = [h(**{**probe, **a, **b}) for a in ({}, moved[0]) for b in ({}, moved[1])]
+            mixed = corners[0] - corners[1] - corners[2] + corners[3]
+            if not bool((mixed.abs() <= ROUNDING * sum(x.abs() for x in corners)).all()):
+                one_name, other = next(iter(first.names)), next(iter(second.names))
+                raise ValueError(
+                    f"controls {one_name!r} and {other!r}: the Hamiltonian is no sum of what it says of each; "
+                    "a thrust and its direction are one ThrustBall"
+                )
+        sets = [part.adapted(_alone(h, part, probe), _alone(cost, part, probe), p, one, unit) for part in self.sets]
+        return replace(self, sets=tuple(sets))
+
+    def minimise(self, h: Hamiltonian, p: Any, like: Tensor, regime: Regime) -> Minimiser:
+        probe = self.probe(torch.ones_like(like))
+        found = [
+            part.minimise(_alone(h, part, probe), p, like, _of(regime, components))
+            for part, components in zip(self.sets, self._components, strict=True)
+        ]
+        control = {name: value for one in found for name, value in one.control.items()}
+        switching, fraction = (
+            torch.cat([getattr(one, name) for one in found], -1) for name in ("switching", "fraction")
+        )
+        return Minimiser(control, switching, fraction)
+
+    def penalty(self, minimiser: Minimiser, p: Any, smoothing: Tensor) -> Tensor:
+        paid = [part.penalty(one, p, smoothing) for part, one in zip(self.sets, self._each(minimiser), strict=True)]
+        return torch.stack(paid).sum(0)
+
+    def samples(self, minimiser: Minimiser, p: Any) -> Minimiser:
+        """Those of each part, the others as they are."""
+        controls, fractions = list[dict[str, Tensor]](), list[Tensor]()
+        for part, one, components in zip(self.sets, self._each(minimiser), self._components, strict=True):
+            own = part.samples(one, p)
+            count = len(next(iter(own.control.values())))
+            controls.append({k: v.expand(count, *v.shape) for k, v in minimiser.control.items()} | own.control)
+            fraction = minimiser.fraction.repeat(count, *[1] * minimiser.fraction.dim())
+            fraction[..., components] = own.fraction
+            fractions.append(fraction)
+        control = {name: torch.cat([each[name] for each in controls]) for name in minimiser.control}
+        return Minimiser(control, minimiser.switching, torch.cat(fractions))
+
+    def _each(self, minimiser: Minimiser) -> list[Minimiser]:
+        """What a minimiser says of each part."""
+        control, switching, fraction = minimiser
+        return [
+            Minimiser(
+                {name: control[name] for name in part.names}, switching[..., functions], fraction[..., components]
+            )
+            for part, functions, components in zip(self.sets, self._functions, self._components, strict=True)
+        ]
+
+
+def _slices(sizes: Sequence[int]) -> list[slice]:
+    return [slice(*ends) for ends in pairwise(accumulate(sizes, initial=0))]
+
+
+def _alone(h: Hamiltonian, part: ControlSet, others: dict[str, Tensor]) -> Hamiltonian:
+    """H as a function of one part's controls."""
+    fixed = {name: value for name, value in others.items() if name not in part.names}
+    return lambda **u: h(**fixed, **u)
+
+
+def _of(regime: Regime, components: slice) -> Regime:
+    """The regime of some components."""
+    arcs, interior = (None if x is None else x[..., components] for x in (regime.arcs, regime.interior))
+    return Regime(regime.smoothing, arcs, interior)
