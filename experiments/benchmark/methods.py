@@ -14,6 +14,7 @@ from ponn_torch.baselines.direct import TwoStage, Unstructured
 from ponn_torch.optimal_control.problem import OptimalControlProblem
 from ponn_torch.problems.earth_mars import earth_mars
 from ponn_torch.problems.mars_landing import mars_landing
+from ponn_torch.problems.small_body_landing import small_body_landing
 from ponn_torch.solving.paths import PolarTransfer
 from ponn_torch.solving.solver import Solver
 from ponn_torch.solving.two_loop import TwoLoop
@@ -28,6 +29,7 @@ PROBLEMS: dict[str, Callable[[], OptimalControlProblem]] = {
         initial_position=(-900.0, 100.0, 1500.0), initial_velocity=(30.0, -10.0, -70.0), **_TFC
     ),
     "tfc_test_2": lambda: mars_landing(initial_velocity=(85.0, 50.0, -65.0), **_TFC),
+    "small_body_landing": small_body_landing,
 }
 # a straight line from Earth to Mars passes too near to the Sun to be a guess
 FIRST: dict[str, Unstructured] = {"earth_mars": Unstructured(80, guess=PolarTransfer())}
