@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from ponn_torch.optimal_control.curve import Curve
-from ponn_torch.solving.switching import grid, share_of_change, switching_along
+from ponn_torch.solving.switching import sampled, share_of_change
 
 LEGIBLE = 0.5  # of the smoothing, by which S stays off zero where no arc is hidden
 RESOLUTION = 2.0  # change of asinh(2S/πρ) along one segment
@@ -27,8 +27,8 @@ def graded_times(curve: Curve, smoothing: float, n_segments: int) -> Tensor:
     the rate of change of asinh(2S/πρ): the knots are spread evenly over its variation and the time together, so that
     halving ρ adds ln 2 / 2 ≈ 0.7 segments for every switch.
     """
-    t, w = grid(curve, max(50, 2000 // curve.collocation.n_segments))
-    variation = torch.asinh(2 * switching_along(curve, t, w) / (math.pi * smoothing)).diff(dim=0).abs().sum(-1)
+    t, s = sampled(curve, max(50, 2000 // curve.collocation.n_segments))
+    variation = torch.asinh(2 * s / (math.pi * smoothing)).diff(dim=0).abs().sum(-1)
     density = variation / RESOLUTION + n_segments * t.diff() / (t[-1] - t[0])
     total = torch.cat([density.new_zeros(1), density.cumsum(0)])
     count = math.ceil(float(total[-1]))
@@ -44,16 +44,10 @@ def legible(curve: Curve, blunter: Curve) -> bool:
     It does if both stay off zero, by half the smoothing, wherever they turn round and at both ends. Both curves lie on
     the same segments.
     """
-    now, before = (_sampled(one) for one in (curve, blunter))
+    now, before = (sampled(one, 201)[1] for one in (curve, blunter))
     then = now + share_of_change(curve, blunter) * (now - before)
     margin = LEGIBLE * curve.smoothing
     return _signs(now) == _signs(then) and all(bool((s[_turns(s)].abs() > margin).all()) for s in (now, then))
-
-
-def _sampled(curve: Curve) -> Tensor:
-    """Switching functions (m, n_switching) between the nodes."""
-    t, w, _, _ = curve.on_segments(curve.collocation.discretisation.nodes.between(200))
-    return switching_along(curve, t, w)
 
 
 def _signs(switching: Tensor) -> list[list[bool]]:

@@ -23,7 +23,7 @@ from ponn_torch.solving.switching import (
     along_arcs,
     claimed_structure,
     find_structure,
-    grid,
+    sampled,
     switching_along,
     wrong_side,
 )
@@ -46,9 +46,8 @@ class Stretch(NamedTuple):
 
 def undecided(curve: Curve, smoothing: float) -> Stretch:
     """The longest stretch over which some |S| ≤ ρ; one without length if there is none."""
-    t, w = grid(curve, max(50, 2000 // curve.collocation.n_segments))
-    longest = Stretch(0, 0.0, 0.0)
-    small = (switching_along(curve, t, w).abs() <= smoothing).unbind(-1)
+    t, s = sampled(curve, max(50, 2000 // curve.collocation.n_segments))
+    longest, small = Stretch(0, 0.0, 0.0), (s.abs() <= smoothing).unbind(-1)
     for function, (inside, level) in enumerate(zip(small, curve.collocation.bvp.law.levels, strict=True)):
         for first, last in _runs(inside) if level.jumps else ():
             longest = max(longest, Stretch(function, float(t[first]), float(t[last])), key=lambda one: one.length)

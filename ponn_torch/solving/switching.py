@@ -60,19 +60,34 @@ def grid(curve: Curve, n_points: int = 400) -> tuple[Tensor, Tensor]:
     return curve.on_segments(_even(n_points, curve.xi.dtype, curve.xi.device))[:2]
 
 
+def sampled(curve: Curve, n_points: int = 400) -> tuple[Tensor, Tensor]:
+    """Scaled times (K·n,) and switching functions (K·n, n_switching) on that grid."""
+
+    made = curve.collocation
+
+    def values() -> tuple[Tensor, Tensor]:
+        # unpacked anew: a tape is not to take what the curve has kept for a constant
+        t, w, _ = made.on_each(made.unpack(curve.xi), _even(n_points, curve.xi.dtype, curve.xi.device))
+        t, w = t.flatten(), w.flatten(0, 1)
+        return t, switching_along(curve, t, w)
+
+    t, switching = made.replayed(f"switching at {n_points}", values, curve.xi)
+    return t, switching
+
+
 def share_of_change(curve: Curve, blunter: Curve) -> float:
     """By how much of its change from a blunter curve a quantity that is linear in ρ changes on the way to ρ = 0."""
     return curve.smoothing / (blunter.smoothing - curve.smoothing)
 
 
-def extrapolated(curve: Curve, blunter: Curve, t: Tensor, w: Tensor) -> Tensor:
-    """S without smoothing at scaled times (m,) of a curve, by Richardson's rule from one of other smoothing.
+def extrapolated(curve: Curve, blunter: Curve, t: Tensor, switching: Tensor) -> Tensor:
+    """S without smoothing from S (m, k) at scaled times (m,) of a curve and one of other smoothing: Richardson's rule.
 
     S moves with ρ nearly in proportion, and much: arcs that S(ρ) does not show yet, as it touches zero only at a
     smaller ρ, are there in what it moves towards (Earth–Mars: all five from ρ = 1 and 0.3, of which each shows three).
     """
-    s, stretch = switching_along(curve, t, w), blunter.times[-1] / curve.times[-1]
-    return s + share_of_change(curve, blunter) * (s - switching_along(blunter, stretch * t))
+    change = switching - switching_along(blunter, blunter.times[-1] / curve.times[-1] * t)
+    return switching + share_of_change(curve, blunter) * change
 
 
 def find_structure(curve: Curve, blunter: Curve | None = None, *, n_points: int = 1000, polish: int = 4) -> Structure:
@@ -81,8 +96,8 @@ def find_structure(curve: Curve, blunter: Curve | None = None, *, n_points: int 
     Without polish S is taken for linear between the points of the grid; so it is where it is extrapolated from a
     ``blunter`` curve.
     """
-    t, w = grid(curve, max(100, n_points // curve.collocation.n_segments))
-    s = switching_along(curve, t, w) if blunter is None else extrapolated(curve, blunter, t, w)
+    t, s = sampled(curve, max(100, n_points // curve.collocation.n_segments))
+    s = s if blunter is None else extrapolated(curve, blunter, t, s)
     switching = partial(switching_along, curve)
     if blunter is not None or not polish:
         switching, polish = partial(_linear, t, s), 1

@@ -25,7 +25,9 @@ from ponn_torch.solving.switching import (
     Structure,
     claimed_structure,
     find_structure,
+    grid,
     needles,
+    sampled,
     switching_along,
     without_short_arcs,
     wrong_side,
@@ -52,6 +54,19 @@ def test_zeros_are_found_to_round_off():
     assert structure.arcs.flatten().tolist() == [UPPER, LOWER, UPPER]
     assert structure.events == ((0,), (0,))
     assert structure.times.tolist() == pytest.approx([PUSH, 3 - PUSH], abs=1e-13)
+
+
+def test_samples_stay_those_of_their_curve_when_a_tape_gives_them():
+    """Also of curves that know more of themselves when they are asked."""
+    first = with_costate(lambda t: SLOPE * (t - 1.5))
+    for i in range(30):
+        curve = replace(first, xi=(1 + 0.01 * i) * first.xi)
+        if i % 2:
+            assert float(curve.times[-1]) > 0
+        t, switching = sampled(curve, 50)
+        expected, w = grid(curve, 50)
+        assert torch.equal(t, expected)
+        torch.testing.assert_close(switching, switching_along(curve, t, w), rtol=1e-13, atol=1e-13)
 
 
 def test_arcs_that_no_smoothed_curve_shows_are_extrapolated():
