@@ -229,6 +229,15 @@ def test_own_problem_from_a_file(own_problem: Path, tmp_path: Path) -> None:
     assert Solution.load(folder / "solution").problem.name == "shift"
 
 
+def test_a_file_may_import_its_neighbour(own_problem: Path, tmp_path: Path) -> None:
+    (own_problem.parent / "neighbour_of_mine.py").write_text("SPEED = 0.0\n", encoding="utf-8")
+    text = own_problem.read_text(encoding="utf-8")
+    own_problem.write_text(f"import neighbour_of_mine\n{text}", encoding="utf-8")
+    path = list(sys.path)
+    assert main([f"problem={own_problem}:shift", "record=minimal", f"hydra.run.dir='{tmp_path / 'run'}'"]) == 0
+    assert sys.path == path
+
+
 def test_columns_are_as_wide_as_the_longest_name_needs(
     own_problem: Path, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
@@ -303,7 +312,7 @@ def test_what_an_own_problem_states_wrongly_is_told_with_its_line(
             "[1.0,2.0]",
             "my problem.py:29: force: maximum = (1.0, 2.0); allowed: a finite number, one for every component",
         ),
-        ("'1'", "my problem.py:26: maximum of the control = '1'; allowed: a number"),
+        ("'1'", "my problem.py:26: maximum of the control 'force' = '1'; allowed: a number"),
     ):
         assert main([f"problem={own_problem}:pushed", f"problem.arguments.bound={bound}"]) == 1
         (line,) = capsys.readouterr().err.splitlines()

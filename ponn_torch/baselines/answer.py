@@ -12,7 +12,7 @@ from ponn_torch.baselines.transcription import Answer, Program
 from ponn_torch.numerics.nodes import interpolation_matrix
 from ponn_torch.optimal_control.boundary_value_problem import BoundaryValueProblem, Setting
 from ponn_torch.optimal_control.collocation import Collocation
-from ponn_torch.optimal_control.control_set import Regime
+from ponn_torch.optimal_control.control_set import INTERIOR, Regime
 from ponn_torch.optimal_control.curve import Curve
 from ponn_torch.optimal_control.pontryagin import pontryagin
 from ponn_torch.optimal_control.problem import OptimalControlProblem
@@ -67,9 +67,10 @@ class DirectSolution:
 
     @property
     def arcs(self) -> list[str]:
-        """Labels of the pinned phases; [] of an unstructured answer."""
+        """Labels of the pinned phases, ``free`` of what is left to the program there; [] of an unstructured answer."""
+        labels = {**ARC_LABELS, INTERIOR: "free"}
         codes = [phase.codes for phase in self.program.phases if phase.codes is not None]
-        return [",".join(ARC_LABELS[code] for code in row) for row in codes]
+        return [",".join(labels[code] for code in row) for row in codes]
 
     @property
     def _states(self) -> Tensor:
@@ -118,8 +119,9 @@ class DirectSolution:
         split, bvp = split or Split(), pontryagin(self.problem)
         times = self._node_times[:: self.program.degree].contiguous()
         parameters = {name: times.new_tensor(value) for name, value in self.problem.parameters.items()}
-        codes = [p.codes or (0,) * len(self.program.variables.bounded) for p in self.program.phases]
-        arcs = torch.tensor([c for c, p in zip(codes, self.program.phases, strict=True) for _ in range(p.n_segments)])
-        setting = Setting(Regime(arcs=arcs), parameters)
+        codes = [p.codes for p in self.program.phases for _ in range(p.n_segments)]
+        # where phases do not say all of them the arcs are read off S
+        told = len(bvp.law.jumping) == bvp.law.n_bounded > 0 and None not in codes
+        setting = Setting(Regime(arcs=torch.tensor(codes) if told else None), parameters)
         collocation = Collocation.on_segments(split.discretisation(bvp), times, setting=setting)
         return split.run(Curve(collocation, project(collocation, self.curve(bvp))))

@@ -113,7 +113,8 @@ class Unstructured:
 class TwoStage:
     """Arcs from an unstructured answer, then a pinned phase of unknown duration for each.
 
-    Control sets without bounds, and those whose Hamiltonian is curved, have no arcs to pin: the first stage answers.
+    A component that H is convex in is left free between its bounds on every phase: where it reaches one inside a phase,
+    the answer is as exact as the mesh. Where nothing jumps there are no arcs to pin, and the first stage answers.
 
     Attributes:
         first: the unstructured stage. n_segments, degree: of the second, all phases together.

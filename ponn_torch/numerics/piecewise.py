@@ -36,13 +36,14 @@ def approximate(
     degree: int = 16,
     n_panels: int = 16,
     tolerance: float = 1e-12,
+    sizes: Array | float = 0.0,
     n_levels: int = 30,
     most_panels: int = 1024,
 ) -> PiecewiseChebyshev:
     """Interpolate f (m,) → (m, k), called once per level of halving.
 
-    ``tolerance`` is relative to the largest |f_k| of each component. A jump is enclosed by panels 2^-n_levels
-    as long as the first.
+    ``tolerance`` is relative to the largest |f_k| of each component, or to its ``sizes`` (k,) elsewhere. A jump is
+    enclosed by panels 2^-n_levels as long as the first.
     """
     angles = np.pi * np.arange(2 * degree + 1) / (2 * degree)
     z = -np.cos(angles)  # every other point is a node, those between are tests
@@ -50,7 +51,7 @@ def approximate(
     at_tests = np.cos(np.outer(np.arccos(z[1::2]), np.arange(degree + 1)))
     edges = np.linspace(start, end, n_panels + 1)
     left, right = edges[:-1], edges[1:]
-    scale: Array | float = 0.0
+    scale = sizes
     before = np.full((n_panels, 2), np.inf)  # largest relative errors of the panels that these came from
     done: list[tuple[float, float, Array]] = []
     for level in range(n_levels):

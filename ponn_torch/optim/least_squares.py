@@ -43,7 +43,7 @@ def identity(norms: Tensor, previous: Tensor | None) -> Tensor:
 SCALINGS = {"marquardt": marquardt, "more": more, "identity": identity}
 
 
-def bounded(scale: Tensor) -> Tensor:
+def floored(scale: Tensor) -> Tensor:
     """D (..., N) without entries below a millionth of the largest: what no equation sees is to be damped too."""
     return torch.maximum(scale, 1e-6 * scale.amax(-1, keepdim=True))
 
@@ -185,7 +185,7 @@ class LevenbergMarquardt(Driven):
         return DampedState(xi, r, scale, damping, growth, contraction, *kept), move
 
     def _scale(self, jacobian: Jacobian, previous: Tensor | None) -> Tensor:
-        return bounded(SCALINGS[self.scaling](jacobian.column_norms(), previous))
+        return floored(SCALINGS[self.scaling](jacobian.column_norms(), previous))
 
     def _update(
         self, damping: Tensor, growth: Tensor, gain: Tensor, accepted: Tensor, running: Tensor

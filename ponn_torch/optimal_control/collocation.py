@@ -77,9 +77,11 @@ class Collocation(Layout):
 
     def value_of(self, parameter: str) -> float:
         """What ``with_setting`` sets: the smoothing, the final time (s), or a named parameter."""
-        if parameter in self.setting.parameters:
-            return float(self.setting.parameters[parameter])
-        return float(self.known_times[-1]) * self.bvp.time_unit if parameter == "final_time" else self.smoothing
+        if parameter == "smoothing":
+            return self.smoothing
+        if parameter == "final_time":
+            return float(self.known_times[-1]) * self.bvp.time_unit
+        return float(self.setting.parameters.get(parameter, self.bvp.problem.parameters[parameter]))
 
     def departures(self) -> dict[str, tuple[float, float]]:
         """Parameters, and a fixed final time in s, that are not as the problem states them: name → (here, stated)."""

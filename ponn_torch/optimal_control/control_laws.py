@@ -219,20 +219,19 @@ class Bounded(ControlSet):
         return one * (low + SHARE * (high - low))
 
     @property
-    def n_scalars(self) -> int:
-        """Bounded components."""
+    def n_bounded(self) -> int:
         return self.size
 
     @property
     def levels(self) -> tuple[Level, ...]:
-        first = [Level(i, LOWER, INTERIOR if i in self.convex else UPPER) for i in range(self.n_scalars)]
+        first = [Level(i, LOWER, INTERIOR if i in self.convex else UPPER) for i in range(self.n_bounded)]
         return (*first, *(Level(i, INTERIOR, UPPER) for i in self.convex))
 
     def by_kind(self, like: Tensor, affine: Callable[[], Tensor], convex: Callable[[], Tensor]) -> Tensor:
         """Values (..., m), each component's by its kind; what no component needs is not computed."""
-        if len(self.convex) in (0, self.n_scalars):
+        if len(self.convex) in (0, self.n_bounded):
             return convex() if self.convex else affine()
-        which = torch.tensor([i in self.convex for i in range(self.n_scalars)], device=like.device)
+        which = torch.tensor([i in self.convex for i in range(self.n_bounded)], device=like.device)
         return torch.where(which, convex(), affine())
 
     def penalty(self, minimiser: Minimiser, p: Any, smoothing: Tensor) -> Tensor:
@@ -257,7 +256,7 @@ class Bounded(ControlSet):
     def _switching(self, at_lower: Tensor, at_upper: Tensor) -> Tensor:
         if not self.convex:
             return at_lower
-        every = len(self.convex) == self.n_scalars
+        every = len(self.convex) == self.n_bounded
         return torch.cat([at_lower, at_upper if every else at_upper[..., list(self.convex)]], -1)
 
 
@@ -282,7 +281,7 @@ class ThrustBall(Bounded):
         return {self.name: self.size, f"{self.name}_magnitude": 1}
 
     @property
-    def n_scalars(self) -> int:
+    def n_bounded(self) -> int:
         return 1
 
     def _controls(self, vector: Tensor, magnitude: Tensor) -> dict[str, Tensor]:

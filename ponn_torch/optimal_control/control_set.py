@@ -62,7 +62,7 @@ def finite(value: Any) -> bool:
 
 
 class ControlSet(Protocol):
-    """The admissible controls and the minimiser of the Hamiltonian over them."""
+    """The admissible controls and the minimiser of the Hamiltonian over them; inherit from it."""
 
     @property
     def factors(self) -> Sequence[ControlSet]:
@@ -108,7 +108,7 @@ class ControlSet(Protocol):
         ...
 
     def adapted(self, h: Hamiltonian, cost: Hamiltonian, p: Any, one: Tensor, unit: float) -> ControlSet:
-        """A copy that knows, from probes of H and of the running cost, whether H is curved and what s is.
+        """A copy that knows, from probes of H and of the running cost, what H is convex in and what s is.
 
         ``h`` and ``cost`` take controls with the batch shape of ``one`` (2k, 1): k points, and these again with the
         opposite costates. ``unit`` is the scale of H, in cost per time, where the running cost does not tell s.

@@ -20,7 +20,7 @@ from ponn_torch.optimal_control.control_set import INTERIOR, LOWER, UPPER, Contr
 from ponn_torch.optimal_control.meaning import Keyed, meaning
 from ponn_torch.optimal_control.problem import Named, OptimalControlProblem, nearest
 
-LONGEST = 3  # of a chain on segments: its last entry is known to ε/h^(q−1), its rate to ε/h^q
+LONGEST = 3  # of a chain: on a segment of length h its last rate is known to ε/h^q only
 MASS_VARIABLES = ("auto", "mass", "log_mass", "delta_v")
 
 
@@ -243,7 +243,7 @@ def find_chains(bvp: BoundaryValueProblem, n_probes: int = 64) -> tuple[Chain, .
     """Find F_i ≡ k w_j by evaluating F at random points, join them, and mark chains whose last rate is zero.
 
     A chain has to hold in every setting: for all values of the parameters, and on every arc. Where there are arcs, and
-    with them short segments, a long one is cut in pieces.
+    with them short segments, long ones are cut.
     """
     longest = LONGEST if bvp.law.n_switching else bvp.dimension
     t, w = probe_points(bvp, n_probes)

@@ -128,6 +128,9 @@ class OptimalControlProblem:
             for name, value in mapping.items():
                 if not (finite(value) and value > 0):
                     raise ValueError(f"{self.name}: {label}[{name!r}] = {value!r}; a positive number is needed")
+        if not hasattr(type(self.control), "factors"):
+            hint = "a control set (Box, ThrustBall, …), or a Product of several"
+            raise ValueError(f"{self.name}: control = {self.control!r}; allowed: {hint}")
         guess = self.final_time.guess if isinstance(self.final_time, FreeTime) else self.final_time
         if not (finite(guess) and guess > 0):
             raise ValueError(f"{self.name}: final_time = {guess!r} s; a positive number is needed")
@@ -143,8 +146,8 @@ class OptimalControlProblem:
         for bounded in (part for part in self.control.factors if isinstance(part, Bounded)):
             for label, bound in (("minimum", bounded.minimum), ("maximum", bounded.maximum)):
                 if isinstance(bound, str) and bound not in self.parameters:
-                    hint = nearest(bound, ["a number", *self.parameters])
-                    raise ValueError(f"{self.name}: {label} of the control = {bound!r}; {hint}")
+                    hint = nearest(bound, ["a number", *(self.parameters or ["a parameter, of which there is none"])])
+                    raise ValueError(f"{self.name}: {label} of the control {bounded.name!r} = {bound!r}; {hint}")
         self._check_display()
         self._check_signatures()
         self._probe()

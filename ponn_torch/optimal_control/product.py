@@ -16,7 +16,7 @@ from torch import Tensor
 
 from ponn_torch.optimal_control.control_set import ControlSet, Hamiltonian, Level, Minimiser, Regime
 
-ELSEWHERE = 0.6  # of a probe, a second one
+N_ELSEWHERE = 5  # other controls of a set, at which its part in H is held against those of the others
 ROUNDING = 1e-9  # of H
 
 
@@ -31,9 +31,10 @@ class Product(ControlSet):
     sets: Sequence[ControlSet]
 
     def __post_init__(self) -> None:
-        if not self.sets:
-            raise ValueError("sets: none given; allowed: at least one control set")
-        object.__setattr__(self, "sets", tuple(self.sets))
+        given = self.sets if isinstance(self.sets, Sequence) else [self.sets]
+        if not given or not all(hasattr(type(one), "factors") for one in given) or given is not self.sets:
+            raise ValueError(f"sets = {self.sets!r}; allowed: a sequence of control sets, at least one")
+        object.__setattr__(self, "sets", tuple(factor for one in given for factor in one.factors))
         twice = [
             name for name, count in Counter(name for part in self.sets for name in part.names).items() if count > 1
         ]
@@ -73,15 +74,17 @@ class Product(ControlSet):
     def adapted(self, h: Hamiltonian, cost: Hamiltonian, p: Any, one: Tensor, unit: float) -> Product:
         probe = self.probe(one)
         for first, second in combinations(self.sets, 2):
-            moved = [part.probe(ELSEWHERE * one) for part in (first, second)]
-            corners = [h(**{**probe, **a, **b}) for a in ({}, moved[0]) for b in ({}, moved[1])]
-            mixed = corners[0] - corners[1] - corners[2] + corners[3]
-            if not bool((mixed.abs() <= ROUNDING * sum(x.abs() for x in corners)).all()):
-                one_name, other = next(iter(first.names)), next(iter(second.names))
-                raise ValueError(
-                    f"controls {one_name!r} and {other!r}: the Hamiltonian is no sum of what it says of each; "
-                    "a thrust and its direction are one ThrustBall"
-                )
+            for moved, other in zip(*(_elsewhere(part, probe, p) for part in (first, second)), strict=True):
+                corners = [h(**probe), h(**probe | moved), h(**probe | other), h(**probe | moved | other)]
+                mixed = corners[0] - corners[1] - corners[2] + corners[3]
+                # where H is not finite it says nothing
+                if bool((mixed.abs() > ROUNDING * sum(x.abs() for x in corners)).any()):
+                    names = [next(iter(part.names)) for part in (first, second)]
+                    raise ValueError(
+                        f"controls {names[0]!r} and {names[1]!r}: the Hamiltonian is no sum of what it says of each; "
+                        "make one of them a state and its rate the control, or one set of both, as a ThrustBall is of "
+                        "a thrust and its direction"
+                    )
         sets = [part.adapted(_alone(h, part, probe), _alone(cost, part, probe), p, one, unit) for part in self.sets]
         return replace(self, sets=tuple(sets))
 
@@ -123,6 +126,16 @@ class Product(ControlSet):
             )
             for part, functions, components in zip(self.sets, self._functions, self._components, strict=True)
         ]
+
+
+def _elsewhere(part: ControlSet, probe: dict[str, Tensor], p: Any) -> list[dict[str, Tensor]]:
+    """Other controls of one set, every component moved on its own."""
+    control = {name: probe[name] for name in part.names}
+    like = next(iter(control.values()))
+    half = like.new_full((*like.shape[:-1], part.n_bounded), 0.5)
+    samples = part.samples(Minimiser(control, half, half), p).control
+    count = len(next(iter(samples.values())))
+    return [{name: value[i] for name, value in samples.items()} for i in range(0, count, -(-count // N_ELSEWHERE))]
 
 
 def _slices(sizes: Sequence[int]) -> list[slice]:

@@ -103,5 +103,10 @@ def _module_from_file(path: Path) -> ModuleType:
         raise ValueError(f"problem file = {str(path)!r} cannot be imported")
     module = importlib.util.module_from_spec(spec)
     sys.modules[name] = module  # dataclasses in the file look their module up
-    spec.loader.exec_module(module)
+    beside = str(path.parent.resolve())
+    sys.path.insert(0, beside)  # as of a script, whose neighbours can be imported
+    try:
+        spec.loader.exec_module(module)
+    finally:
+        sys.path.remove(beside)
     return module

@@ -28,9 +28,7 @@ Along = Callable[[Tensor, Tensor], Tensor]  # (t, w) → (...,)
 
 def singular_components(law: ControlSet, arcs: Tensor | None) -> tuple[int, ...]:
     """Components with an interior arc among codes (K, m), of those that H is affine in."""
-    if arcs is None or not law.jumps:
-        return ()
-    return tuple(i for i in (arcs == INTERIOR).any(0).nonzero()[:, 0].tolist() if i in law.jumping)
+    return () if arcs is None else tuple(i for i in law.jumping if bool((arcs[..., i] == INTERIOR).any()))
 
 
 def singular_fractions(bvp: BoundaryValueProblem, t: Tensor, w: Tensor, setting: Setting) -> Tensor:

@@ -27,7 +27,7 @@ def planar_car(
     maximum_acceleration: float = 1.0,
     maximum_turn: float | None = None,
     turning_price: float = 1.0,
-    final_time: float = 4.0,
+    guess: float = 4.0,
     regulariser: str = "entropy",
     known_cost: float | None = None,
     name: str = "planar_car",
@@ -35,16 +35,17 @@ def planar_car(
     """Minimise ∫ 1 + ½ k ω² dt with ṙ = s (cos h, sin h), ḣ = ω, ṡ = a, |a| ≤ ``maximum_acceleration``.
 
     Two controls of different kinds: H is affine in a, which jumps, and quadratic in ω, with or without a bound.
-    ``final_time`` is a guess. Straight ahead over d the answer is bang-bang and takes 2 √(d/a).
+    ``guess`` is of the time. Straight ahead over d the answer is bang-bang and takes 2 √(d/a). The known optimum is
+    a certified extremal's, which direct collocation meets.
     """
     check_vectors(2, initial_position=initial_position, final_position=final_position)
-    check_positive(maximum_acceleration=maximum_acceleration, turning_price=turning_price, final_time=final_time)
+    check_positive(maximum_acceleration=maximum_acceleration, turning_price=turning_price, guess=guess)
     turn: ControlSet = Unconstrained("turn", 1)
     if maximum_turn is not None:
         check_positive(maximum_turn=maximum_turn)
         turn = Box("turn", maximum_turn, -maximum_turn)
     if known_cost is None:
-        known_cost = known_optimum(planar_car, locals(), OPTIMA)
+        known_cost = known_optimum(planar_car, locals(), OPTIMA, ["guess"])
     throttle = Box(
         "acceleration", maximum_acceleration, -maximum_acceleration, regulariser=make_regulariser(regulariser)
     )
@@ -63,8 +64,8 @@ def planar_car(
         running_cost=lambda t, x, u, p: 1.0 + 0.5 * turning_price * u.turn**2,
         initial={"r": list(initial_position), "heading": initial_heading, "speed": 0.0},
         final={"r": list(final_position), "heading": final_heading, "speed": 0.0},
-        final_time=FreeTime(final_time),
-        units={"r": length, "heading": 1.0, "speed": length / final_time, "time": final_time, "cost": final_time},
+        final_time=FreeTime(guess),
+        units={"r": length, "heading": 1.0, "speed": length / guess, "time": guess, "cost": guess},
         cost_name="cost",
         known_cost=known_cost,
     )

@@ -210,8 +210,9 @@ def signs(solution: Solution, tolerance: float, n_points: int = 401) -> tuple[fl
                 break
             left, right = z[peaks - 1], z[peaks + 1]
             z = (left[:, None] + (right - left)[:, None] * fractions).flatten().unique()
-        zero = (switching(even[1:-1]).abs() <= tolerance).double().mean(0)
-        for level, part in zip(levels, zero.tolist(), strict=True):
-            if level.jumps and codes[level.component] != INTERIOR:  # S = 0 is singular, and has to be claimed as that
-                share = max(share, part)
+        if solution.bvp.law.jumps:
+            zero = (switching(even[1:-1]).abs() <= tolerance).double().mean(0)
+            for component, function in solution.bvp.law.jumping.items():
+                if codes[component] != INTERIOR:  # S = 0 is singular, and has to be claimed as that
+                    share = max(share, float(zero[function]))
     return deepest, share

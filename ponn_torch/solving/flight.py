@@ -157,8 +157,11 @@ def control_history(solution: Solution) -> list[PiecewiseChebyshev]:
 
         return control
 
-    arcs = zip(solution.arc_segments, pairwise(knots), strict=True)
-    return [approximate(on(segments), start, end) for segments, (start, end) in arcs]
+    arcs = list(zip(map(on, solution.arc_segments), pairwise(knots), strict=True))
+    # of the whole: where a control is zero on an arc, it is not to be resolved to the last digit of its round-off
+    middles = [control(np.array([0.5 * (start + end)])) for control, (start, end) in arcs]
+    sizes = np.abs(np.concatenate(middles)).max(0)
+    return [approximate(control, start, end, sizes=sizes) for control, (start, end) in arcs]
 
 
 def _point_setting(solution: Solution, smoothing: Tensor | None, arcs: Tensor | None) -> Setting:

@@ -15,25 +15,24 @@ import torch
 from torch import Tensor
 
 from ponn_torch.optim.base import Residual
-from ponn_torch.optim.least_squares import bounded
+from ponn_torch.optim.least_squares import floored
 
 PREDICTORS = ("tangent", "none")
 SOLVED = 0.02  # of ‖r‖ at the new value, that may be left at the old one: what is no solution is on no curve of them
 
 
 def along_tangent(
-    residual: Callable[[float], Residual], xi: Tensor, here: float, there: float, damping: float
+    residual: Callable[[float], Residual], xi: Tensor, norm: float, here: float, there: float, damping: float
 ) -> Tensor:
     """ξ (N,) moved from its solution at the value ``here`` towards that at ``there``; as it is where that is no nearer.
 
-    damping: μ of the one step, relative to J's columns.
+    norm: ‖r‖ here. damping: μ of the one step, relative to J's columns.
     """
-    share = math.sqrt(torch.finfo(xi.dtype).eps)
-    r, jacobian = residual(here).linearise(xi)
-    target = residual(there)
+    share, target = math.sqrt(torch.finfo(xi.dtype).eps), residual(there)
     before = target.residual(xi).norm()
-    if not bool(r.norm() <= SOLVED * before):
+    if not norm <= SOLVED * float(before):
         return xi
+    r, jacobian = residual(here).linearise(xi)
     change = (residual(here + share * (there - here)).residual(xi) - r) / share
-    moved = xi + jacobian.solve_damped(change, xi.new_tensor(damping), bounded(jacobian.column_norms()))
+    moved = xi + jacobian.solve_damped(change, xi.new_tensor(damping), floored(jacobian.column_norms()))
     return moved if bool(target.residual(moved).norm() < before) else xi  # NaN is no less

@@ -81,7 +81,7 @@ class Restart:
         """
         made = self._solved.curve.collocation
         arcs, disc = made.setting.regime.arcs, made.discretisation
-        if arcs is None or arcs.shape[-1] != bvp.law.n_bounded:
+        if arcs is None or made.bvp.law.levels != bvp.law.levels:
             return None
         times = self._solved.curve.times.to(bvp.unit) * (made.bvp.time_unit / bvp.time_unit)
         if not bvp.problem.free_final_time:

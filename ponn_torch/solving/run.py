@@ -26,6 +26,11 @@ OVERFLOW = (
     "the equations are finite along no guess, which has states of the order of their units: measure states from where "
     "they begin (altitudes, not radii), or guess a path"
 )
+NOT_THROUGH = "not through the first stages"
+ELSEWHERE = (
+    "no start came through its first stages: guess a path (a straight line, say), or set costate_units to the sizes "
+    "that costates have"
+)
 MOST_REPEATS = 3  # starts that lead there, after which others are taken to lead there too
 
 
@@ -96,6 +101,8 @@ class Run:
             said.append(f"of {n_starts} starts: {tally}")
         if self.stages.done and all(stage.status is Status.NON_FINITE for stage in self.stages.done):
             said.append(OVERFLOW)
+        elif len(self.causes) >= MOST_REPEATS and set(self.causes) == {NOT_THROUGH}:
+            said.append(ELSEWHERE)
         said.append(self.stages.bvp.problem.scaling_hint())
         text = "; ".join(part for part in said if part)
         return text if not self.clock.spent or Status.BUDGET.value in text else f"{Status.BUDGET.value}: {text}"
@@ -116,7 +123,7 @@ class Run:
             return restarted, note
         stages, message = self._continuation(collocation, xi)
         if not stages:
-            self.causes.append("not through the first stages")
+            self.causes.append(NOT_THROUGH)
             return None, message
         start = stages[-1].curve.knots[0]
         if any(float((start - other).abs().max()) < 1e-5 * float(start.abs().max()) for other in self.refused):

@@ -28,6 +28,7 @@ def graded_times(curve: Curve, smoothing: float, n_segments: int) -> Tensor:
     halving ρ adds ln 2 / 2 ≈ 0.7 segments for every switch.
     """
     t, s = sampled(curve, max(50, 2000 // curve.collocation.n_segments))
+    s = s[:, list(curve.collocation.bvp.law.jumping.values())]  # of those that are smoothed
     variation = torch.asinh(2 * s / (math.pi * smoothing)).diff(dim=0).abs().sum(-1)
     density = variation / RESOLUTION + n_segments * t.diff() / (t[-1] - t[0])
     total = torch.cat([density.new_zeros(1), density.cumsum(0)])
@@ -41,13 +42,14 @@ def graded_times(curve: Curve, smoothing: float, n_segments: int) -> Tensor:
 def legible(curve: Curve, blunter: Curve) -> bool:
     """Whether S shows the arcs that it has without smoothing: those that it is extrapolated to from a blunter curve.
 
-    It does if both stay off zero, by half the smoothing, wherever they turn round and at both ends. Both curves lie on
-    the same segments.
+    It does if both stay off zero, by half the smoothing, wherever they turn round and at both ends: those that are
+    smoothed. Both curves lie on the same segments.
     """
     now, before = (sampled(one, 201)[1] for one in (curve, blunter))
     then = now + share_of_change(curve, blunter) * (now - before)
-    margin = LEGIBLE * curve.smoothing
-    return _signs(now) == _signs(then) and all(bool((s[_turns(s)].abs() > margin).all()) for s in (now, then))
+    margin, smoothed = LEGIBLE * curve.smoothing, list(curve.collocation.bvp.law.jumping.values())
+    clear = (bool((s[_turns(s)].abs() > margin).all()) for s in (now[:, smoothed], then[:, smoothed]))
+    return _signs(now) == _signs(then) and all(clear)
 
 
 def _signs(switching: Tensor) -> list[list[bool]]:

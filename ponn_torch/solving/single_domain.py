@@ -43,15 +43,16 @@ def find_layers(curve: Curve, smoothing: Tensor | None) -> Layers:
     """The zeros of S along a curve, as layers of the control at a smoothing; none without one."""
     start, end = curve.times[0], curve.times[-1]
     structure, half = find_structure(curve), (end - start) / 2
-    if smoothing is None or not structure.events:
+    smoothed = set(curve.collocation.bvp.law.jumping.values())
+    events = [[function for function in event if function in smoothed] for event in structure.events]
+    if smoothing is None or not any(events):
         return Layers(start.new_zeros(0), start.new_zeros(0))
-    step = 1e-5 * half
-    before, after = (switching_along(curve, (structure.times + d).clamp(start, end)) for d in (-step, step))
-    steepest = torch.stack(
-        [(row[list(event)]).abs().amax() for row, event in zip(after - before, structure.events, strict=True)]
-    )
+    step, times = 1e-5 * half, structure.times[[bool(event) for event in events]]
+    before, after = (switching_along(curve, (times + d).clamp(start, end)) for d in (-step, step))
+    pairs = zip(after - before, filter(None, events), strict=True)
+    steepest = torch.stack([row[event].abs().amax() for row, event in pairs])
     slopes = steepest / (2 * step) * half
-    return Layers((structure.times - start) / half - 1.0, (smoothing / slopes).clamp_max(1.0))
+    return Layers((times - start) / half - 1.0, (smoothing / slopes).clamp_max(1.0))
 
 
 @dataclass(frozen=True)

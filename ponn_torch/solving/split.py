@@ -52,6 +52,8 @@ MOVED = 1e-3  # fraction of the final time: arcs are split anew where a sharper 
 SAME_SWITCH = 1e-6  # scaled times that differ by less are those of one switch
 MOST_UNSOLVED = 3  # sharpened curves in a row that are no solutions, after which there is none this way
 SMALLEST_STEP = 0.9  # factor on the smoothing, above which a curve is not sharpened any more
+WHOLE = 0.99  # of the time: where S vanishes for as long, the control has nothing to decide
+NOT_UNIQUE = ": all the time, so that this control has nothing to decide; a small price on it makes it unique"
 MORE_SEGMENTS = 4  # multiples of n_segments that are tried where there is no smoothing to lower
 
 
@@ -143,6 +145,8 @@ class Split(Segmentation, Refinement):
         if singular is None:
             return refined
         unit = start.collocation.bvp.problem.display.get("time", DisplayUnit("s"))
+        if singular.length >= WHOLE * float(smoothed.times[-1]):
+            return Refined(smoothed, Outcome.SINGULAR, rounds, NOT_UNIQUE)
         ends = [f"{t * start.collocation.bvp.time_unit / unit.size:.4g}" for t in (singular.start, singular.end)]
         return Refined(smoothed, Outcome.SINGULAR, rounds, f": from {ends[0]} to {ends[1]} {unit.label}")
 

@@ -164,6 +164,8 @@ def wrong_side(switching: Tensor, codes: Tensor, levels: Sequence[Level]) -> Ten
 
     On a singular arc both sides are wrong: its code is neither above nor below.
     """
+    if not levels:
+        return switching
     components, below, above = (codes.new_tensor(column) for column in zip(*levels, strict=True))
     claimed = codes.expand(*switching.shape[:-1], -1).index_select(-1, components)
     depth = torch.where(claimed >= above, -switching, switching)

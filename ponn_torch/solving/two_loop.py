@@ -45,7 +45,7 @@ class TwoLoop(Segmentation, Refinement):
             self.discretisation(start.collocation.bvp),
             torch.cat([start.times[:1], structure.times, start.times[-1:]]),
             events=structure.events,
-            setting=Setting(Regime(arcs=structure.arcs), parameters),
+            setting=Setting(Regime(arcs=structure.arcs if structure.arcs.numel() else None), parameters),
         )
         loops = _Loops(self, collocation, project(collocation, start), callback(collocation) if callback else None)
         try:

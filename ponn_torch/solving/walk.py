@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field, replace
 
 from torch import Tensor
@@ -21,7 +22,8 @@ from ponn_torch.solving.stages import Stages
 class Walk:
     """One start on its way down the schedule: where it stands, and the stages so far that can be trusted.
 
-    n_failed: first stages that failed; until one has not, the walk has not begun. form: of the last stage tried.
+    norm: ‖r‖ there. n_failed: first stages that failed; until one has not, the walk has not begun. form: of the last
+    stage tried.
     """
 
     stages: Stages
@@ -30,6 +32,7 @@ class Walk:
     kept: list[Solution] = field(default_factory=list)
     message: str = ""
     begun: bool = False
+    norm: float = math.inf
     n_failed: int = 0
     form: Form | None = None
 
@@ -55,19 +58,20 @@ class Walk:
         # measurements need not fit: what counts are the equations
         norm = float(result.norm if stages.measurements is None else trial.residual(result.xi).norm())
         if norm < stages.solver.start_limit:
-            return self._advanced(trial, result.xi, solution, hold)
+            return self._advanced(trial, result.xi, float(result.norm), solution, hold)
         return Outcome.FAILED if self.begun else self._not_begun(solution, result, norm, parameter)
 
     def _predicted(self, trial: Collocation, parameter: str, value: float) -> Tensor:
         """Where the stage begins. Of a network that is trained no tangent is known: its Jacobian leaves many."""
-        solver, here = self.stages.solver, self.collocation.value_of(parameter)
+        solver = self.stages.solver
         if solver.predictor == "none" or len(trial.linear_unknowns) < trial.n_unknowns:
             return self.xi
 
         def residual(at: float) -> Residual:
             return self.stages.residual(trial.with_setting(**{parameter: at}))
 
-        return along_tangent(residual, self.xi, here, value, solver.warm_damping)
+        here = self.collocation.value_of(parameter)
+        return along_tangent(residual, self.xi, self.norm, here, value, solver.warm_damping)
 
     def arrive(self) -> None:
         """End at the problem as stated: a last stage where the schedule ended at another value of a parameter.
@@ -86,14 +90,14 @@ class Walk:
     def _as_stated(self) -> list[Solution]:
         return [solution for solution in self.kept if not solution.curve.collocation.departures()]
 
-    def _advanced(self, trial: Collocation, xi: Tensor, solution: Solution, hold: bool) -> Outcome:
+    def _advanced(self, trial: Collocation, xi: Tensor, norm: float, solution: Solution, hold: bool) -> Outcome:
         """A stage that is solved: the walk goes there, and keeps it if it can be trusted."""
         stages, self.begun = self.stages, True
         trusted = stages.trusted(solution)
         if hold and not trusted:
             return Outcome.UNTRUSTED
         change = float((xi - self.xi).abs().max())
-        self.collocation, self.xi = trial, xi
+        self.collocation, self.xi, self.norm = trial, xi, norm
         if trusted or not self.kept:
             self.kept.append(solution)
         if not trusted and len(self.kept) == 1:

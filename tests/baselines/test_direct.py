@@ -48,7 +48,7 @@ def bounded_car() -> OptimalControlProblem:
 BANG_BANG: dict[Callable[[], OptimalControlProblem], tuple[list[str], list[float], float]] = {
     minimum_time: (["max", "min"], [1.0], 2.0),
     planar_car: (["max", "min"], [1.7176930388739], 3.4353860777478),
-    bounded_car: (["max,interior", "min,interior"], [1.7176930388739], 3.4353860777478),
+    bounded_car: (["max,free", "min,free"], [1.7176930388739], 3.4353860777478),
     minimum_fuel: (["max", "min", "max"], [1.5 - 1.25**0.5, 1.5 + 1.25**0.5], 3.0),
     mars_landing: (["max", "min", "max"], [31.0920056478, 39.2202817443], 44.823),
     tfc_test_1: (["min", "max"], [7.4430057683], 31.2623123369),
@@ -104,6 +104,21 @@ def test_the_split_certifies_a_direct_answer() -> None:
     certificate = certify(Solution(refined.curve))
     assert certificate.certified, certificate.verdict
     assert certificate.cost == pytest.approx(275.2062387119, abs=1e-9)
+
+
+def test_the_split_finds_the_bounds_that_a_direct_answer_leaves_to_its_mesh() -> None:
+    refined = TwoStage().solve(planar_car(maximum_turn=0.5)).refined()
+    solution = Solution(refined.curve)
+    assert certify(solution).certified
+    assert solution.arcs == ["max,max", "max,interior", "min,interior", "min,max"]
+
+
+def test_an_answer_without_bounds_is_refined_and_judged() -> None:
+    solution = Solution(Unstructured().solve(minimum_energy()).refined().curve)
+    assert solution.arcs == []
+    certificate = certify(solution)
+    assert "off node residual" in certificate.verdict  # of its many short segments
+    assert certificate.cost == pytest.approx(6.0, abs=1e-9)
 
 
 def test_too_little_time_is_not_called_solved() -> None:

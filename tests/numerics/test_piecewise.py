@@ -48,3 +48,13 @@ def test_noise_costs_few_panels():
     history = approximate(lambda t: (np.exp(t) + 1e-9 * generator.standard_normal(t.shape))[:, None], 0.0, 1.0)
     assert len(history.edges) < 70
     assert float(history(0.5)[0]) == pytest.approx(np.exp(0.5), abs=1e-8)
+
+
+def test_noise_about_zero_costs_few_panels_where_the_size_is_known():
+    """A control that is zero along an arc, to round-off, is not resolved to the digits of that."""
+
+    def noise(t):
+        return 1e-17 * np.sin(1e9 * t)[:, None]
+
+    assert len(approximate(noise, 0.0, 1.0, sizes=np.array([0.5])).edges) == 17
+    assert len(approximate(noise, 0.0, 1.0).edges) > 500

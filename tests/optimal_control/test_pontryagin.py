@@ -16,7 +16,7 @@ from ponn_torch.optimal_control.boundary_value_problem import BoundaryValueProbl
 from ponn_torch.optimal_control.control_laws import Box
 from ponn_torch.optimal_control.control_set import Regime
 from ponn_torch.optimal_control.pontryagin import pontryagin
-from ponn_torch.optimal_control.problem import OptimalControlProblem
+from ponn_torch.optimal_control.problem import FreeTime, OptimalControlProblem
 
 RHO = 0.3
 Rates = dict[str, Tensor]
@@ -395,6 +395,26 @@ def test_the_energy_optimal_double_integrator_is_one_chain_of_four():
     (chain,) = chains.values()
     assert chain.trivial  # x is the cubic that the ends determine
     assert chain.factors == pytest.approx((1.0, 1.0, -1.0, 1.0))
+
+
+@pytest.mark.parametrize("order", [4, 5])
+def test_long_chains_are_cut_where_there_are_arcs(order):
+    """The last rate of one would be known to ε/h^q only on a segment of length h."""
+    names = [f"x{i}" for i in range(order)]
+    made = OptimalControlProblem(
+        name="integrators",
+        states=dict.fromkeys(names, 1),
+        control=Box("u", 1.0, -1.0),
+        dynamics=lambda t, x, u, p: {
+            name: getattr(x, after) if after else u.u for name, after in zip(names, [*names[1:], None], strict=True)
+        },
+        running_cost=lambda t, x, u, p: torch.ones_like(t),
+        initial=dict.fromkeys(names, 0.0) | {"x0": 1.0},
+        final=dict.fromkeys(names, 0.0),
+        final_time=FreeTime(4.0),
+    )
+    lengths = sorted(len(chain.columns) for chain in pontryagin(made).chains)
+    assert lengths == sorted([3, order - 3] * 2)
 
 
 @pytest.mark.parametrize("name", ["minimum_time", "minimum_fuel"])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import pytest
@@ -13,8 +14,12 @@ from torch import Tensor
 from ponn_torch.optimal_control.control_laws import Box, ThrustBall, Unconstrained
 from ponn_torch.optimal_control.control_set import INTERIOR, LOWER, UPPER, ControlSet, Regime
 from ponn_torch.optimal_control.pontryagin import pontryagin
-from ponn_torch.optimal_control.problem import OptimalControlProblem
+from ponn_torch.optimal_control.problem import FreeTime, OptimalControlProblem
 from ponn_torch.optimal_control.product import Product
+from ponn_torch.solving.certificate import certify
+from ponn_torch.solving.family import Family
+from ponn_torch.solving.restart import Restart
+from ponn_torch.solving.solution import Solution
 from ponn_torch.solving.solver import Solver
 
 NONE = SimpleNamespace()
@@ -76,7 +81,7 @@ def test_each_is_minimised_as_it_would_be_alone(slopes, order, smoothed):
     values = hamiltonian(order, c)(**others.control)
     assert float(hamiltonian(order, c)(**sharp.control)) <= float(values.min()) + 1e-12
     assert others.fraction.shape == (len(values), 1, law.n_bounded)
-    assert {name for name in others.control if not torch.equal(*others.control[name][[0, -1]])}
+    assert all(len(value.unique(dim=0)) > 1 for value in others.control.values())
 
 
 def test_levels_count_components_through():
@@ -92,18 +97,60 @@ def test_levels_count_components_through():
     assert (law.n_bounded, law.n_switching, law.jumps) == (3, 4, True)
 
 
-def test_controls_that_h_couples_are_refused():
-    law = Product((Box("speed", 2.0), Box("turn", 1.0, -1.0)))
+COUPLED = {
+    "scalars": ((Box("a", 2.0), Box("b", 1.0, -1.0)), lambda a, b: a * b),
+    "a difference": ((Box("a", 1.0, -1.0, size=2), Box("b", 1.0, -1.0)), lambda a, b: (a[..., :1] - a[..., 1:]) * b),
+    "a probe at zero": ((Box("a", 0.63, -0.37), Box("b", 1.0, -1.0)), lambda a, b: a * b),
+    "without bounds": ((Unconstrained("a", 1), Box("b", 1.0, -1.0)), lambda a, b: a**2 + a * b),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", COUPLED)
+def test_controls_that_h_couples_are_refused(kind):
+    sets, h = COUPLED[kind]
     one = torch.ones(2, 1, dtype=torch.float64)
-    with torch.no_grad(), pytest.raises(ValueError, match="controls 'speed' and 'turn': the Hamiltonian is no sum"):
-        law.adapted(lambda speed, turn: speed * turn, lambda speed, turn: speed, NONE, one, 1.0)
+    with torch.no_grad(), pytest.raises(ValueError, match="controls 'a' and 'b': the Hamiltonian is no sum"):
+        Product(sets).adapted(h, h, NONE, one, 1.0)
+
+
+def test_a_thrust_whose_components_something_else_weighs_is_refused():
+    def h(T, T_magnitude, b):
+        return (T[..., :1] - T[..., 1:]) * b + T_magnitude
+
+    one = torch.ones(2, 1, dtype=torch.float64)
+    with torch.no_grad(), pytest.raises(ValueError, match="controls 'T' and 'b'"):
+        Product((ThrustBall("T", 3.0, size=2), Box("b", 1.0, -1.0))).adapted(h, h, NONE, one, 1.0)
+
+
+def test_where_h_is_not_finite_it_says_nothing_of_couplings():
+    def h(a, b):
+        return a + torch.where(b.abs() > 2, torch.nan, b**2 + b)
+
+    one = torch.ones(2, 1, dtype=torch.float64)
+    with torch.no_grad():
+        law = Product((Box("a", 1.0), Unconstrained("b", 1))).adapted(h, h, NONE, one, 1.0)
+    assert law.n_bounded == 1
 
 
 def test_a_name_stands_for_one_control():
     with pytest.raises(ValueError, match="several controls are called 'u'"):
         Product((Box("u", 2.0), Unconstrained("u", 1)))
-    with pytest.raises(ValueError, match="none given"):
-        Product(())
+
+
+@pytest.mark.parametrize("sets", [(), Box("u", 1.0), (Box,), [None]])
+def test_what_is_no_list_of_sets_is_told(sets):
+    with pytest.raises(ValueError, match=r"sets = .*allowed: a sequence of control sets"):
+        Product(sets)
+
+
+def test_several_controls_without_a_product_are_told_of_it():
+    with pytest.raises(ValueError, match=r"control = .*allowed: .*a Product of several"):
+        replace(carts(), control=(Box("a", 1.0), Box("b", 1.0)))
+
+
+def test_products_of_products_are_flat():
+    inner = Product((Box("a", 1.0), Box("b", 1.0)))
+    assert [part.name for part in Product((inner, Box("c", 1.0))).factors] == ["a", "b", "c"]
 
 
 def pushed_and_turned(*, first: ControlSet, second: ControlSet) -> OptimalControlProblem:
@@ -147,3 +194,83 @@ def test_the_equations_know_all_controls():
     assert [chain.columns for chain in bvp.chains] == [(0, 2), (1, 3), (6, 4), (7, 5)]
     assert made.control.factors[0].name == "a"
     assert bvp.law.factors[1].convex == (0,)
+
+
+def carts(**sets: ControlSet) -> OptimalControlProblem:
+    return pushed_and_turned(**{"first": ThrustBall("a", 5.0, size=1), "second": Box("b", 5.0, -5.0), **sets})
+
+
+@pytest.fixture(scope="module")
+def solved() -> Solution:
+    return Solver().solve(carts()).solution
+
+
+def test_it_is_saved_and_loaded(solved, tmp_path):
+    solved.save(tmp_path)
+    again = Solution.load(tmp_path, carts())
+    assert again.arcs == solved.arcs
+    assert again.cost == solved.cost
+    assert certify(again).certified
+
+
+def test_it_starts_others(solved):
+    """By its arcs where the switching functions mean the same, by its curve where they do not."""
+    farther = replace(carts(), final={"x": [1.0, 0.95], "v": [0.0, 0.0]})
+    result = Solver(guess=Restart(solved)).solve(farther)
+    assert result.certified
+    assert [stage.name for stage in result.stages] == ["split"]
+    swapped = replace(carts(), control=Product((Box("b", 5.0, -5.0), ThrustBall("a", 5.0, size=1))))
+    result = Solver(guess=Restart(solved)).solve(swapped)
+    assert result.certified
+    assert result.solution.cost == pytest.approx(solved.cost, abs=1e-10)
+    assert result.stages[0].name == "smooth"
+
+
+def test_neighbours_restart_together(solved):
+    starts = torch.tensor([[0.0, 0.0, 0.0, 0.0], [0.01, 0.0, -0.01, 0.02]], dtype=torch.float64)
+    family, solved_too = Family.of(solved.curve).restart(starts)
+    assert bool(solved_too.all())
+    assert float(family.collocation.residual(family.xi).norm(dim=-1).max()) < 1e-9
+
+
+def switched(*, beside: ControlSet) -> OptimalControlProblem:
+    """½∫x² + ½ b² with ẋ = a, ẏ = b, |a| ≤ 1: full speed to x = 0, then the singular arc a = 0; y at constant speed."""
+    return OptimalControlProblem(
+        name="switched",
+        states={"x": 1, "y": 1},
+        control=Product((beside, Box("a", 1.0, -1.0))),
+        dynamics=lambda t, x, u, p: {"x": u.a, "y": u.b},
+        running_cost=lambda t, x, u, p: 0.5 * x.x**2 + 0.5 * u.b**2,
+        initial={"x": 1.0, "y": 0.0},
+        final={"x": 0.0, "y": 1.0},
+        final_time=2.0,
+    )
+
+
+@pytest.mark.parametrize(("beside", "arcs"), [
+    (Unconstrained("b", 1), ["min", "singular"]),
+    (Box("b", 3.0, -3.0), ["interior,min", "interior,singular"]),
+])  # fmt: skip
+def test_a_singular_arc_beside_another_control(beside, arcs):
+    result = Solver().solve(switched(beside=beside))
+    assert result.certified, result.message
+    assert result.solution.arcs == arcs
+    assert result.solution.cost == pytest.approx(1 / 6 + 1 / 4, abs=1e-11)
+    assert result.solution.switch_times == pytest.approx([1.0], abs=1e-9)
+
+
+def test_a_control_with_nothing_to_decide_is_said_to_be_so():
+    """Two carts in least time, of which one arrives early whatever it does in between."""
+    made = OptimalControlProblem(
+        name="slack",
+        states={"x": 1, "v": 1, "y": 1, "w": 1},
+        control=Product((Box("a", 1.0, -1.0), Box("b", 1.0, -1.0))),
+        dynamics=lambda t, x, u, p: {"x": x.v, "v": u.a, "y": x.w, "w": u.b},
+        running_cost=lambda t, x, u, p: torch.ones_like(t),
+        initial={"x": 1.0, "v": 0.0, "y": 0.5, "w": 0.0},
+        final={"x": 0.0, "v": 0.0, "y": 0.0, "w": 0.0},
+        final_time=FreeTime(3.0),
+    )
+    result = Solver(n_starts=1).solve(made)
+    assert not result.certified
+    assert "all the time, so that this control has nothing to decide" in result.message

@@ -55,8 +55,8 @@ def column(value: float) -> Tensor:
 
 
 def test_the_step_is_that_of_euler():
-    assert float(along_tangent(Root, column(2.0), 4.0, 5.0, 0.0)) == pytest.approx(2.25, abs=1e-7)
-    assert float(along_tangent(Root, column(2.0), 4.0, 3.0, 0.0)) == pytest.approx(1.75, abs=1e-7)
+    assert float(along_tangent(Root, column(2.0), 0.0, 4.0, 5.0, 0.0)) == pytest.approx(2.25, abs=1e-7)
+    assert float(along_tangent(Root, column(2.0), 0.0, 4.0, 3.0, 0.0)) == pytest.approx(1.75, abs=1e-7)
 
 
 @pytest.mark.parametrize(
@@ -69,12 +69,12 @@ def test_the_step_is_that_of_euler():
 )
 def test_a_step_that_does_not_lead_from_a_solution_nearer_to_another_is_not_taken(start, here):
     xi = column(start)
-    assert along_tangent(Root, xi, here, 1.0, 0.0) is xi
+    assert along_tangent(Root, xi, abs(start**2 - here), here, 1.0, 0.0) is xi
 
 
 def test_damping_keeps_what_no_equation_sees_where_it_is():
     xi = torch.tensor([2.0, 0.0], dtype=torch.float64)
-    moved = along_tangent(Half, xi, 4.0, 5.0, 1e-8)
+    moved = along_tangent(Half, xi, 0.0, 4.0, 5.0, 1e-8)
     assert moved.tolist() == pytest.approx([2.25, 0.0], abs=1e-6)
 
 
@@ -94,7 +94,7 @@ def test_solutions_that_are_straight_in_a_parameter_are_met_exactly():
     def at(value: float):
         return curve.collocation.with_setting(push=value)
 
-    moved = along_tangent(at, curve.xi, 1.0, 3.0, 0.0)
+    moved = along_tangent(at, curve.xi, curve.residual_norm, 1.0, 3.0, 0.0)
     assert float(at(3.0).residual(curve.xi).norm()) > 0.1
     assert float(at(3.0).residual(moved).norm()) < 1e-6
 
@@ -107,7 +107,7 @@ def test_along_the_smoothing_the_error_is_of_second_order(smoothed_landing):
 
     def missed(there: float) -> float:
         solved = LevenbergMarquardt(Stopping(tolerance=1e-13, decrease=1e-5), damping=1e-10).run(at(there), curve.xi)
-        return float((along_tangent(at, curve.xi, 0.1, there, 1e-12) - solved.xi).norm())
+        return float((along_tangent(at, curve.xi, curve.residual_norm, 0.1, there, 1e-12) - solved.xi).norm())
 
     coarse, fine = missed(0.08), missed(0.09)
     assert coarse / fine == pytest.approx(4.0, rel=0.5)
@@ -135,7 +135,7 @@ def test_it_is_for_weights_that_are_linear_and_can_be_turned_off(monkeypatch, se
     ladder = Ladder((1.5, 1.0), parameter="push")
     solver = Solver(**settings, optimizer=optimizer, continuation=ladder, start_limit=1e3, refinement=None)
     assert len(solver.solve(pushed()).stages) > 1
-    assert [rest[:2] for rest in steps] == ([(1.5, 1.0)] if taken else [])
+    assert [rest[1:3] for rest in steps] == ([(1.5, 1.0)] if taken else [])
 
 
 def test_an_unknown_predictor_is_told_what_there_is():

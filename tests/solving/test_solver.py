@@ -768,6 +768,14 @@ def test_a_stage_that_missed_its_tolerance_is_not_the_only_one_that_arcs_are_rea
     assert result.solution.arcs == ["max", "min", "max"]
 
 
+def test_where_no_start_comes_through_it_is_said_what_may_help():
+    solver = Solver(n_starts=3, start_limit=1e-300, continuation=Single())
+    result = solver.solve(problem("mars_landing"))
+    assert not result.certified
+    assert "of 3 starts: 3 × not through the first stages" in result.message
+    assert "guess a path (a straight line, say), or set costate_units" in result.message
+
+
 def test_starts_take_their_number_of_segments_in_turn():
     result = Solver(n_segments=(1, 3), n_starts=2, start_limit=1e-300, continuation=Single()).solve(
         problem("earth_mars")
