@@ -5,13 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import accumulate, pairwise
 
 import torch
 from torch import Tensor
 
 from ponn_torch.optimal_control.control_laws import Box, ThrustBall, Unconstrained
-from ponn_torch.optimal_control.control_set import LOWER, UPPER, ControlSet
+from ponn_torch.optimal_control.control_set import LOWER, UPPER, ControlSet, side_by_side
 from ponn_torch.optimal_control.problem import Named, OptimalControlProblem
 
 
@@ -78,15 +77,15 @@ def _side_by_side(each: Sequence[ControlVariables]) -> ControlVariables:
     """The variables of several sets, one after the other."""
     if len(each) == 1:
         return each[0]
-    sizes, n_codes = [one.size for one in each], [len(one.bounded) for one in each]
+    sizes = [one.size for one in each]
+    places, of_codes = side_by_side(sizes), side_by_side([len(one.bounded) for one in each])
     ruled = [i for i, one in enumerate(each) if one.rows is not None]
 
     def limits(of: Sequence[Limits]) -> Limits:
         return Limits(*([x for piece in side for x in piece] for side in zip(*map(_sides, of), strict=True)))
 
     def pinned(codes: Sequence[int]) -> Limits:
-        ends = [*accumulate(n_codes, initial=0)]
-        return limits([one.pinned(codes[a:b]) for one, (a, b) in zip(each, pairwise(ends), strict=True)])
+        return limits([one.pinned(codes[own]) for one, own in zip(each, of_codes, strict=True)])
 
     def rows(nu: Tensor) -> Tensor:
         pieces = nu.split(sizes, -1)
@@ -100,9 +99,7 @@ def _side_by_side(each: Sequence[ControlVariables]) -> ControlVariables:
         free=limits([one.free for one in each]),
         pinned=pinned,
         start=[x for one in each for x in one.start],
-        bounded=[
-            start + i for one, start in zip(each, accumulate(sizes, initial=0), strict=False) for i in one.bounded
-        ],
+        bounded=[place.start + i for one, place in zip(each, places, strict=True) for i in one.bounded],
         controls=controls,
         inverse=lambda control: torch.cat([one.inverse(control) for one in each], -1),
         rows=rows if ruled else None,

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from itertools import accumulate, pairwise
 from typing import Any, NamedTuple, Protocol
 
 import torch
@@ -59,6 +60,16 @@ def finite(value: Any) -> bool:
         return math.isfinite(value)
     except (TypeError, ValueError, RuntimeError):  # what is no number; what is several; torch's word for the same
         return False
+
+
+def side_by_side(sizes: Sequence[int]) -> list[slice]:
+    """Where pieces of these sizes stand, one after the other."""
+    return [slice(*ends) for ends in pairwise(accumulate(sizes, initial=0))]
+
+
+def is_control_set(value: object) -> bool:
+    """Whether a value is a control set, and neither several of them nor a class."""
+    return hasattr(type(value), "factors")
 
 
 class ControlSet(Protocol):

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from ponn_torch.optimal_control.control_laws import Bounded
-from ponn_torch.optimal_control.control_set import ControlSet, finite
+from ponn_torch.optimal_control.control_set import ControlSet, finite, is_control_set, side_by_side
 
 SIGNATURES = {  # what the functions of a problem are called with
     "dynamics": ("t", "x", "u", "p"),
@@ -128,7 +128,7 @@ class OptimalControlProblem:
             for name, value in mapping.items():
                 if not (finite(value) and value > 0):
                     raise ValueError(f"{self.name}: {label}[{name!r}] = {value!r}; a positive number is needed")
-        if not hasattr(type(self.control), "factors"):
+        if not is_control_set(self.control):
             hint = "a control set (Box, ThrustBall, …), or a Product of several"
             raise ValueError(f"{self.name}: control = {self.control!r}; allowed: {hint}")
         guess = self.final_time.guess if isinstance(self.final_time, FreeTime) else self.final_time
@@ -169,11 +169,7 @@ class OptimalControlProblem:
 
     @property
     def slices(self) -> dict[str, slice]:
-        out, start = {}, 0
-        for name, size in self.states.items():
-            out[name] = slice(start, start + size)
-            start += size
-        return out
+        return dict(zip(self.states, side_by_side(list(self.states.values())), strict=True))
 
     @property
     def component_names(self) -> list[str]:

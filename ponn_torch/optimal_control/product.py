@@ -8,13 +8,21 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import accumulate, combinations, pairwise
+from itertools import combinations
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from ponn_torch.optimal_control.control_set import ControlSet, Hamiltonian, Level, Minimiser, Regime
+from ponn_torch.optimal_control.control_set import (
+    ControlSet,
+    Hamiltonian,
+    Level,
+    Minimiser,
+    Regime,
+    is_control_set,
+    side_by_side,
+)
 
 N_ELSEWHERE = 5  # other controls of a set, at which its part in H is held against those of the others
 ROUNDING = 1e-9  # of H
@@ -31,8 +39,8 @@ class Product(ControlSet):
     sets: Sequence[ControlSet]
 
     def __post_init__(self) -> None:
-        given = self.sets if isinstance(self.sets, Sequence) else [self.sets]
-        if not given or not all(hasattr(type(one), "factors") for one in given) or given is not self.sets:
+        given = self.sets
+        if not (isinstance(given, Sequence) and given and all(map(is_control_set, given))):
             raise ValueError(f"sets = {self.sets!r}; allowed: a sequence of control sets, at least one")
         object.__setattr__(self, "sets", tuple(factor for one in given for factor in one.factors))
         twice = [
@@ -60,12 +68,12 @@ class Product(ControlSet):
     @property
     def _components(self) -> list[slice]:
         """Where the components of each part stand among those of all."""
-        return _slices([part.n_bounded for part in self.sets])
+        return side_by_side([part.n_bounded for part in self.sets])
 
     @property
     def _functions(self) -> list[slice]:
         """Where the switching functions of each part stand."""
-        return _slices([part.n_switching for part in self.sets])
+        return side_by_side([part.n_switching for part in self.sets])
 
     def probe(self, one: Tensor) -> dict[str, Tensor]:
         return {name: value for part in self.sets for name, value in part.probe(one).items()}
@@ -136,10 +144,6 @@ def _elsewhere(part: ControlSet, probe: dict[str, Tensor], p: Any) -> list[dict[
     samples = part.samples(Minimiser(control, half, half), p).control
     count = len(next(iter(samples.values())))
     return [{name: value[i] for name, value in samples.items()} for i in range(0, count, -(-count // N_ELSEWHERE))]
-
-
-def _slices(sizes: Sequence[int]) -> list[slice]:
-    return [slice(*ends) for ends in pairwise(accumulate(sizes, initial=0))]
 
 
 def _alone(h: Hamiltonian, part: ControlSet, others: dict[str, Tensor]) -> Hamiltonian:

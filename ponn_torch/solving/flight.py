@@ -147,21 +147,23 @@ def control_history(solution: Solution) -> list[PiecewiseChebyshev]:
     """The solution's control over scaled time, per arc; all names side by side, in the user's units."""
     curve, knots = solution.curve, arc_knots(solution)
 
+    def control(times: Tensor, segment: Tensor) -> Array:
+        w, setting = solution.at(times, segment)
+        best = solution.bvp.minimiser(times[:, None], w, setting)
+        return torch.cat(list(best.control.values()), -1).double().cpu().numpy()
+
     def on(segments: range) -> Callable[[Array], Array]:
-        def control(t: Array) -> Array:
+        def along(t: Array) -> Array:
             times = torch.as_tensor(t).to(curve.xi)
-            segment = curve.segment_of(times).clamp(segments.start, segments.stop - 1)
-            w, setting = solution.at(times, segment)
-            best = solution.bvp.minimiser(times[:, None], w, setting)
-            return torch.cat(list(best.control.values()), -1).double().cpu().numpy()
+            return control(times, curve.segment_of(times).clamp(segments.start, segments.stop - 1))
 
-        return control
+        return along
 
-    arcs = list(zip(map(on, solution.arc_segments), pairwise(knots), strict=True))
-    # of the whole: where a control is zero on an arc, it is not to be resolved to the last digit of its round-off
-    middles = [control(np.array([0.5 * (start + end)])) for control, (start, end) in arcs]
-    sizes = np.abs(np.concatenate(middles)).max(0)
-    return [approximate(control, start, end, sizes=sizes) for control, (start, end) in arcs]
+    # sizes are of the whole: where a control is zero on an arc, its round-off is not to be resolved to the last digit
+    middles = curve.xi.new_tensor([0.5 * (start + end) for start, end in pairwise(knots)])
+    sizes = np.abs(control(middles, curve.segment_of(middles))).max(0)
+    arcs = zip(solution.arc_segments, pairwise(knots), strict=True)
+    return [approximate(on(segments), start, end, sizes=sizes) for segments, (start, end) in arcs]
 
 
 def _point_setting(solution: Solution, smoothing: Tensor | None, arcs: Tensor | None) -> Setting:

@@ -22,10 +22,9 @@ from ponn_torch.solving.switching import (
     Structure,
     along_arcs,
     claimed_structure,
+    depth_along,
     find_structure,
     sampled,
-    switching_along,
-    wrong_side,
 )
 
 ROUNDING = 1e-9  # of the terms of S̈, below which it does not depend on the control
@@ -47,9 +46,9 @@ class Stretch(NamedTuple):
 def undecided(curve: Curve, smoothing: float) -> Stretch:
     """The longest stretch over which some |S| ≤ ρ; one without length if there is none."""
     t, s = sampled(curve, max(50, 2000 // curve.collocation.n_segments))
-    longest, small = Stretch(0, 0.0, 0.0), (s.abs() <= smoothing).unbind(-1)
-    for function, (inside, level) in enumerate(zip(small, curve.collocation.bvp.law.levels, strict=True)):
-        for first, last in _runs(inside) if level.jumps else ():
+    longest = Stretch(0, 0.0, 0.0)
+    for function in curve.collocation.bvp.law.jumping.values():
+        for first, last in _runs(s[:, function].abs() <= smoothing):
             longest = max(longest, Stretch(function, float(t[first]), float(t[last])), key=lambda one: one.length)
     return longest
 
@@ -113,9 +112,8 @@ def at_turned_switches(curve: Curve, tolerance: float) -> Structure | None:
     if not curve.collocation.bvp.law.jumps:
         return None
     claimed = claimed_structure(curve)
-    t, w, arc = along_arcs(curve)
     levels = curve.collocation.bvp.law.levels
-    depth = wrong_side(switching_along(curve, t, w), claimed.arcs[arc], levels)
+    t, _, _, depth = depth_along(curve, claimed)
     found = claimed
     for time, events in zip(claimed.times.tolist(), claimed.events, strict=True):
         before, after = int((t < time).sum()), int((t <= time).sum())

@@ -182,6 +182,13 @@ def along_arcs(curve: Curve) -> tuple[Tensor, Tensor, Tensor]:
     return t, w, of_segment.repeat_interleave(n_points).to(t.device)
 
 
+def depth_along(curve: Curve, claimed: Structure) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Scaled times (m,) on that grid, the arc of each, S (m, k) there, and how far it is on the wrong side (m, k)."""
+    t, w, arc = along_arcs(curve)
+    switching = switching_along(curve, t, w)
+    return t, arc, switching, wrong_side(switching, claimed.arcs[arc], curve.collocation.bvp.law.levels)
+
+
 def needles(curve: Curve, width: float, tolerance: float) -> list[Structure]:
     """The structures of a split ``curve`` with one short arc more where S is on the wrong side; the deepest first.
 
@@ -194,9 +201,7 @@ def needles(curve: Curve, width: float, tolerance: float) -> list[Structure]:
         return []
     arcs, events, levels = claimed.arcs, claimed.events, curve.collocation.bvp.law.levels
     ends = torch.cat([curve.times[:1], claimed.times, curve.times[-1:]])
-    t, w, arc = along_arcs(curve)
-    switching = switching_along(curve, t, w)
-    depth = wrong_side(switching, arcs[arc], levels)
+    t, arc, switching, depth = depth_along(curve, claimed)
     found: list[tuple[float, Structure]] = []
     for event, column in enumerate(depth.unbind(-1)):
         # runs of points on the wrong side, cut where an arc ends

@@ -58,7 +58,7 @@ class Walk:
         # measurements need not fit: what counts are the equations
         norm = float(result.norm if stages.measurements is None else trial.residual(result.xi).norm())
         if norm < stages.solver.start_limit:
-            return self._advanced(trial, result.xi, float(result.norm), solution, hold)
+            return self._advanced(solution, float(result.norm), hold)
         return Outcome.FAILED if self.begun else self._not_begun(solution, result, norm, parameter)
 
     def _predicted(self, trial: Collocation, parameter: str, value: float) -> Tensor:
@@ -90,14 +90,15 @@ class Walk:
     def _as_stated(self) -> list[Solution]:
         return [solution for solution in self.kept if not solution.curve.collocation.departures()]
 
-    def _advanced(self, trial: Collocation, xi: Tensor, norm: float, solution: Solution, hold: bool) -> Outcome:
+    def _advanced(self, solution: Solution, norm: float, hold: bool) -> Outcome:
         """A stage that is solved: the walk goes there, and keeps it if it can be trusted."""
         stages, self.begun = self.stages, True
         trusted = stages.trusted(solution)
         if hold and not trusted:
             return Outcome.UNTRUSTED
+        xi = solution.curve.xi
         change = float((xi - self.xi).abs().max())
-        self.collocation, self.xi, self.norm = trial, xi, norm
+        self.collocation, self.xi, self.norm = solution.curve.collocation, xi, norm
         if trusted or not self.kept:
             self.kept.append(solution)
         if not trusted and len(self.kept) == 1:
