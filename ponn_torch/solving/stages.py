@@ -108,14 +108,16 @@ class Stages:
         """What the smoothed stages solve: the equations, and the measurements where there are any."""
         return collocation if self.measurements is None else Measured(collocation, self.measurements)
 
-    def optimise(self, name: str, collocation: Collocation, xi: Tensor, optimizer: Optimizer) -> OptimizeResult:
+    def optimise(
+        self, name: str, collocation: Collocation, equations: Residual, xi: Tensor, optimizer: Optimizer
+    ) -> OptimizeResult:
+        """Minimise the residual of ``equations``, which are those of the collocation and may be more."""
         self.observer.stage_started(name, collocation.smoothing or None, len(self.done))
-        residual = self.residual(collocation)
-        told = self.callback(collocation, residual)
+        told = self.callback(collocation, equations)
         if self.journal is None:
-            result = optimizer.run(residual, xi, told)
+            result = optimizer.run(equations, xi, told)
         else:
-            result = self.journal.run(optimizer, residual, xi, told, self.clock.add)
+            result = self.journal.run(optimizer, equations, xi, told, self.clock.add)
         if result.status is Status.INTERRUPTED:
             self.record(name, Curve(collocation, result.xi), result)
             raise Interrupted

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, replace
 from torch import Tensor
 
 from ponn_torch.optim.base import NonFiniteResidual, OptimizeResult, Residual, warm
+from ponn_torch.optim.remembering import Remembering
 from ponn_torch.optimal_control.collocation import Collocation
 from ponn_torch.optimal_control.curve import Curve
 from ponn_torch.optimal_control.discretisation import Form
@@ -22,8 +23,8 @@ from ponn_torch.solving.stages import Stages
 class Walk:
     """One start on its way down the schedule: where it stands, and the stages so far that can be trusted.
 
-    norm: ‖r‖ there. n_failed: first stages that failed; until one has not, the walk has not begun. form: of the last
-    stage tried.
+    norm: ‖r‖ there. equations: what was solved there. n_failed: first stages that failed; until one has not, the walk
+    has not begun. form: of the last stage tried.
     """
 
     stages: Stages
@@ -33,6 +34,7 @@ class Walk:
     message: str = ""
     begun: bool = False
     norm: float = math.inf
+    equations: Residual | None = None
     n_failed: int = 0
     form: Form | None = None
 
@@ -45,12 +47,15 @@ class Walk:
         trial = replace(self.collocation, discretisation=stages.discretisation(form))
         if smoothed:
             trial = trial.with_setting(**{parameter: value})
-        optimizer, xi = stages.optimizer, self.xi
+        optimizer, xi, equations = stages.optimizer, self.xi, stages.residual(trial)
+        if stages.solver.predictor != "none" and len(trial.linear_unknowns) == trial.n_unknowns:
+            equations = Remembering(equations)  # of a network that is trained no tangent is known: J leaves many
         if self.begun:
             optimizer = warm(optimizer, stages.solver.warm_damping)
-            xi = self._predicted(trial, parameter, value)
+            if isinstance(equations, Remembering):
+                xi = self._predicted(trial, equations, parameter, value)
         try:
-            result = stages.optimise("smooth", trial, xi, optimizer)
+            result = stages.optimise("smooth", trial, equations, xi, optimizer)
         except NonFiniteResidual as error:
             self.message = str(error)
             return Outcome.FAILED if self.begun else Outcome.ABORT
@@ -58,20 +63,20 @@ class Walk:
         # measurements need not fit: what counts are the equations
         norm = float(result.norm if stages.measurements is None else trial.residual(result.xi).norm())
         if norm < stages.solver.start_limit:
-            return self._advanced(solution, float(result.norm), hold)
+            return self._advanced(solution, equations, float(result.norm), hold)
         return Outcome.FAILED if self.begun else self._not_begun(solution, result, norm, parameter)
 
-    def _predicted(self, trial: Collocation, parameter: str, value: float) -> Tensor:
-        """Where the stage begins. Of a network that is trained no tangent is known: its Jacobian leaves many."""
-        solver = self.stages.solver
-        if solver.predictor == "none" or len(trial.linear_unknowns) < trial.n_unknowns:
-            return self.xi
+    def _predicted(self, trial: Collocation, equations: Residual, parameter: str, value: float) -> Tensor:
+        """Where the stage begins: along the tangent from where the walk stands."""
+        here = self.collocation.value_of(parameter)
+        known = {value: equations}
+        if self.equations is not None and self.collocation.discretisation is trial.discretisation:
+            known[here] = self.equations
 
         def residual(at: float) -> Residual:
-            return self.stages.residual(trial.with_setting(**{parameter: at}))
+            return known[at] if at in known else self.stages.residual(trial.with_setting(**{parameter: at}))
 
-        here = self.collocation.value_of(parameter)
-        return along_tangent(residual, self.xi, self.norm, here, value, solver.warm_damping)
+        return along_tangent(residual, self.xi, self.norm, here, value, self.stages.solver.warm_damping)
 
     def arrive(self) -> None:
         """End at the problem as stated: a last stage where the schedule ended at another value of a parameter.
@@ -90,7 +95,7 @@ class Walk:
     def _as_stated(self) -> list[Solution]:
         return [solution for solution in self.kept if not solution.curve.collocation.departures()]
 
-    def _advanced(self, solution: Solution, norm: float, hold: bool) -> Outcome:
+    def _advanced(self, solution: Solution, equations: Residual, norm: float, hold: bool) -> Outcome:
         """A stage that is solved: the walk goes there, and keeps it if it can be trusted."""
         stages, self.begun = self.stages, True
         trusted = stages.trusted(solution)
@@ -98,7 +103,7 @@ class Walk:
             return Outcome.UNTRUSTED
         xi = solution.curve.xi
         change = float((xi - self.xi).abs().max())
-        self.collocation, self.xi, self.norm = solution.curve.collocation, xi, norm
+        self.collocation, self.xi, self.norm, self.equations = solution.curve.collocation, xi, norm, equations
         if trusted or not self.kept:
             self.kept.append(solution)
         if not trusted and len(self.kept) == 1:
