@@ -80,14 +80,17 @@ def share_of_change(curve: Curve, blunter: Curve) -> float:
     return curve.smoothing / (blunter.smoothing - curve.smoothing)
 
 
-def extrapolated(curve: Curve, blunter: Curve, t: Tensor, switching: Tensor) -> Tensor:
-    """S without smoothing from S (m, k) at scaled times (m,) of a curve and one of other smoothing: Richardson's rule.
+def extrapolated(curve: Curve, blunter: Curve, n_points: int) -> tuple[Tensor, Tensor]:
+    """What ``sampled`` gives, S without smoothing, from a curve and one of other smoothing: Richardson's rule.
 
     S moves with ρ nearly in proportion, and much: arcs that S(ρ) does not show yet, as it touches zero only at a
     smaller ρ, are there in what it moves towards (Earth–Mars: all five from ρ = 1 and 0.3, of which each shows three).
     """
-    change = switching - switching_along(blunter, blunter.times[-1] / curve.times[-1] * t)
-    return switching + share_of_change(curve, blunter) * change
+    t, now = sampled(curve, n_points)
+    stretched = blunter.times[-1] / curve.times[-1]
+    same_segments = curve.times.shape == blunter.times.shape and torch.allclose(stretched * curve.times, blunter.times)
+    before = sampled(blunter, n_points)[1] if same_segments else switching_along(blunter, stretched * t)
+    return t, now + share_of_change(curve, blunter) * (now - before)
 
 
 def find_structure(curve: Curve, blunter: Curve | None = None, *, n_points: int = 1000, polish: int = 4) -> Structure:
@@ -96,8 +99,8 @@ def find_structure(curve: Curve, blunter: Curve | None = None, *, n_points: int 
     Without polish S is taken for linear between the points of the grid; so it is where it is extrapolated from a
     ``blunter`` curve.
     """
-    t, s = sampled(curve, max(100, n_points // curve.collocation.n_segments))
-    s = s if blunter is None else extrapolated(curve, blunter, t, s)
+    n_points = max(100, n_points // curve.collocation.n_segments)
+    t, s = sampled(curve, n_points) if blunter is None else extrapolated(curve, blunter, n_points)
     switching = partial(switching_along, curve)
     if blunter is not None or not polish:
         switching, polish = partial(_linear, t, s), 1
