@@ -214,6 +214,7 @@ def _solver(node: dict[str, Any], top: Mapping[str, Any]) -> Solver:
     for key in (
         "n_starts",
         "n_certified",
+        "coarse",
         "n_segments",
         "mass_variable",
         "start_limit",

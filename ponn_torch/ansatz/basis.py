@@ -24,6 +24,10 @@ class FreeFunction(nn.Module, ABC):
     def arguments(self) -> dict[str, Any]:
         """What the class is called with, in JSON's types, to make this function again up to its buffers."""
 
+    def coarser(self, share: float) -> FreeFunction:
+        """The same with a share of its functions, if they are the first ones of a sequence that converges."""
+        return self
+
 
 class LinearBasis(FreeFunction):
     """`size` functions phi_l, tabulated with their derivatives by `features`."""
@@ -68,6 +72,10 @@ class _OrthogonalPolynomials(LinearBasis):
 
     def beyond(self, n_supports: int) -> LinearBasis:
         return type(self)(self.size, lowest_degree=self.lowest_degree + n_supports)
+
+    def coarser(self, share: float) -> LinearBasis:
+        size = max(1, round(share * self.size))
+        return self if size == self.size else type(self)(size, lowest_degree=self.lowest_degree)
 
     @staticmethod
     @abstractmethod

@@ -21,6 +21,7 @@ class Outcome(Enum):
     SOLVED = "solved"
     UNCHANGED = "solved, and the same as before: smaller values change nothing"
     LEGIBLE = "solved, and sharp enough for what comes next: this schedule is done"
+    SHARPEST = "solved, and a smaller value is not to be resolved: this schedule is done"
     UNTRUSTED = "solved at the nodes, but not between them"
     FAILED = "not solved"
     ABORT = "give this start up"
@@ -28,7 +29,7 @@ class Outcome(Enum):
     @property
     def final(self) -> bool:
         """Nothing more of a schedule is to be tried."""
-        return self in (Outcome.ABORT, Outcome.LEGIBLE)
+        return self in (Outcome.ABORT, Outcome.LEGIBLE, Outcome.SHARPEST)
 
 
 class Attempt(Protocol):

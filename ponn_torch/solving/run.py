@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
 
 import torch
 from torch import Tensor
@@ -111,7 +110,7 @@ class Run:
         """The collocation of the first stage, and a start's guess projected on it."""
         bvp, stream = self.stages.bvp, STREAMS * self.stages.seed + start
         share = torch.linspace(0.0, 1.0, self.solver.n_segments_of(start) + 1, dtype=torch.float64).to(bvp.unit)
-        collocation = Collocation.on_segments(self.stages.discretisation(None), share * bvp.final_time)
+        collocation = Collocation.on_segments(self.stages.discretisation(None, coarse=True), share * bvp.final_time)
         if bvp.law.jumps:
             collocation = collocation.with_setting(smoothing=1.0)
         return collocation, project(collocation, self.solver.guess.curve(bvp, stream))
@@ -121,19 +120,31 @@ class Run:
         restarted, note = self._restarted()
         if restarted is not None or (note and self.clock.spent):
             return restarted, note
-        stages, message = self._continuation(collocation, xi)
-        if not stages:
-            self.causes.append(NOT_THROUGH)
-            return None, message
-        start = stages[-1].curve.knots[0]
-        if any(float((start - other).abs().max()) < 1e-5 * float(start.abs().max()) for other in self.refused):
-            self.causes.append(SAME)
-            return None, ""
-        refined, note = self._refined(stages)
-        if note:
-            self.refused.append(start)
-            self.causes.append(note)
-        return refined, note
+        walk, led = Walk(self.stages, collocation, xi), list[Tensor]()
+        found, cause = None, NOT_THROUGH
+        while True:
+            self.solver.continuation.run(walk)
+            walk.arrive()
+            if walk.kept:
+                start = walk.kept[-1].curve.knots[0]
+                if any(_same(start, other) for other in led):  # finer, it is what it was
+                    break
+                if any(_same(start, other) for other in self.refused):
+                    cause = SAME
+                    break
+                led.append(start)
+                found, note = self._refined(walk)
+                cause = note
+            else:
+                note = note or walk.message
+            finer = walk.finer()
+            if not note or finer is None or self.clock.spent:
+                break
+            walk = finer
+        if cause:
+            self.refused += led
+            self.causes.append(cause)
+        return found, note
 
     def _judged(self, candidate: Solution, *, solved: bool) -> tuple[Solution, Certificate]:
         """A candidate with its certificate; what is solved, but not exact enough, is solved once more, finer."""
@@ -170,28 +181,19 @@ class Run:
         norm = curve.collocation.residual(curve.xi).norm()
         self.stages.record("restart", curve, OptimizeResult(curve.xi, norm, status))
 
-    # -- smoothed stages ---------------------------------------------------------------------------------------------
-
-    def _continuation(self, collocation: Collocation, xi: Tensor) -> tuple[list[Solution], str]:
-        """Walk the schedule from one start; the stages that can be trusted, the sharpest last, or none and why."""
-        walk = Walk(self.stages, collocation, xi)
-        self.solver.continuation.run(walk)
-        walk.arrive()
-        return walk.kept, walk.message
-
     # -- refinement ---------------------------------------------------------------------------------------------------
 
-    def _refined(self, stages: Sequence[Solution]) -> tuple[Solution, str]:
+    def _refined(self, walk: Walk) -> tuple[Solution, str]:
         """The refined solution where the refinement succeeds or improves, else the smoothed one and why.
 
         It starts from the sharpest stage, and if that fails from the sharpest that had met its tolerance: a stage that
-        had not may show other arcs.
+        had not may show other arcs. A coarse one seldom does, and is made finer instead.
         """
-        refinement = self.solver.refinement
+        refinement, stages = self.solver.refinement, walk.kept
         if refinement is None:
             return stages[-1], ""
         refined, note = self._refine(refinement, stages[-1], self.stages.blunter(stages))
-        if not note or not refinement.reads_arcs or self.clock.spent:
+        if not note or not refinement.reads_arcs or walk.coarse or self.clock.spent:
             return refined, note
         solved = [i for i, stage in enumerate(stages) if stage.curve.residual_norm < self.solver.stage_tolerance]
         if solved and solved[-1] < len(stages) - 1:
@@ -215,6 +217,11 @@ class Run:
         if refined.outcome is refinements.Outcome.SOLVED or (improved and not refinement.exact):
             return solution, ""
         return smoothed, f"{name}: {refined.message}"
+
+
+def _same(start: Tensor, other: Tensor) -> bool:
+    """Whether two smoothed solutions are one, by w (2n,) where they begin."""
+    return float((start - other).abs().max()) < 1e-5 * float(start.abs().max())
 
 
 def _better(one: Certificate, other: Certificate) -> bool:

@@ -54,6 +54,8 @@ class Solver:
     Attributes:
         basis: free function of the smoothed stages: a basis (its size is the number of neurons per chain) or a network.
         node_kind, n_nodes: collocation points per segment. form: strong or weak residual.
+        coarse: share of the neurons and nodes that a start goes with where it only leads to a refinement; with all of
+            them where its first stage needs them, or the refinement fails. For polynomials and strong residuals.
         n_segments: fixed segments of the smoothed stages, or of each start's in turn: where one polynomial does not
             follow the solution, pieces may.
         optimizer, continuation, guess: of the smoothed stages. refinement: None to stop at the smoothed solution.
@@ -78,6 +80,7 @@ class Solver:
     n_nodes: int = 60
     form: Form = field(default_factory=Strong)
     conditioning: str = "columns"
+    coarse: float = 0.55
     n_segments: int | Sequence[int] = (1, 1, 4, 1, 1, 4, 4, 4, 4)
     optimizer: Optimizer = field(default_factory=_default_optimizer)
     continuation: Schedule = field(default_factory=lambda: Ladder((1.0, 0.3, 0.1, 0.03)))
@@ -111,6 +114,8 @@ class Solver:
             raise ValueError(f"n_segments = {self.n_segments}; allowed: at least 1, or a list of such numbers")
         if self.predictor not in PREDICTORS:
             raise ValueError(f"predictor = {self.predictor!r}; {nearest(self.predictor, PREDICTORS)}")
+        if not 0 < self.coarse <= 1:
+            raise ValueError(f"coarse = {self.coarse}; allowed: above 0, to 1")
         if not self.warm_damping >= 0:
             raise ValueError(f"warm_damping = {self.warm_damping}; allowed: a number ≥ 0")
         if self.dtype != torch.float64 and self.exact:  # whose rounds end far below the round-off of float32
@@ -156,7 +161,17 @@ class Solver:
         values = {"problem": problem, "seed": seed, **settings, "basis": basis}
         return {name: fingerprint(value) for name, value in values.items()}
 
-    def discretisation(self, bvp: BoundaryValueProblem, form: Form | None = None) -> Discretisation:
-        like = bvp.unit
-        nodes = make_nodes(self.node_kind, self.n_nodes, dtype=like.dtype, device=like.device)
-        return discretise(bvp, self.basis, nodes, form or self.form, self.conditioning)
+    def coarsens(self, form: Form) -> bool:
+        """Whether starts go with fewer neurons and nodes first."""
+        leads_on = self.refinement is not None and self.refinement.reads_arcs
+        return leads_on and isinstance(form, Strong) and self.basis.coarser(self.coarse) is not self.basis
+
+    def discretisation(
+        self, bvp: BoundaryValueProblem, form: Form | None = None, *, coarse: bool = False
+    ) -> Discretisation:
+        """That of the smoothed stages; the coarse one may be the same."""
+        like, form, basis, n_nodes = bvp.unit, form or self.form, self.basis, self.n_nodes
+        if coarse and self.coarsens(form):
+            basis, n_nodes = basis.coarser(self.coarse), max(1, round(self.coarse * n_nodes))
+        nodes = make_nodes(self.node_kind, n_nodes, dtype=like.dtype, device=like.device)
+        return discretise(bvp, basis, nodes, form, self.conditioning)

@@ -68,7 +68,7 @@ class Stages:
         self.bvp = pontryagin(problem, mass_variable=solver.mass_variable, dtype=solver.dtype, device=solver.device)
         self.done: list[StageResult] = []
         self.start = 0
-        self._discretisations: dict[Form, Discretisation] = {}
+        self._discretisations: dict[tuple[Form, bool], Discretisation] = {}
         self.clock = Budget(solver.cpu_seconds)
         if journal is not None:
             journal.belongs_to(solver.determined_by(problem, seed))
@@ -76,11 +76,12 @@ class Stages:
 
     # -- one more ------------------------------------------------------------------------------------------------------
 
-    def discretisation(self, form: Form | None) -> Discretisation:
+    def discretisation(self, form: Form | None, *, coarse: bool = False) -> Discretisation:
         """That of a form, the solver's where it is None; kept, as to find it among those of other solves takes time."""
-        key = form or self.solver.form
+        form = form or self.solver.form
+        key = form, coarse and self.solver.coarsens(form)
         if key not in self._discretisations:
-            self._discretisations[key] = self.solver.discretisation(self.bvp, key)
+            self._discretisations[key] = self.solver.discretisation(self.bvp, form, coarse=coarse)
         return self._discretisations[key]
 
     @property
@@ -159,8 +160,10 @@ class Stages:
         """
         return self.solver.exact and self.bvp.law.n_switching == 0 and result.status.stationary
 
-    def trusted(self, solution: Solution) -> bool:
+    def trusted(self, solution: Solution, share: float = 1.0) -> bool:
         """Whether the stage's equations hold between the nodes too (a weak form claims its moments only).
+
+        With a ``share`` of what they may miss there.
 
         A refinement that reads no arcs off the curve may start from any stage: a coarse one needs more segments.
         """
@@ -169,7 +172,7 @@ class Stages:
             return True
         if not isinstance(solution.curve.collocation.discretisation.form, Strong):
             return True
-        return solution.off_node_residual <= self.solver.trust * solution.curve.largest_rate
+        return solution.off_node_residual <= share * self.solver.trust * solution.curve.largest_rate
 
     def blunter(self, stages: Sequence[Solution]) -> Curve | None:
         """The stage before the last, if it was smoothed more."""

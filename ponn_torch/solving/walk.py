@@ -13,18 +13,21 @@ from ponn_torch.optimal_control.collocation import Collocation
 from ponn_torch.optimal_control.curve import Curve
 from ponn_torch.optimal_control.discretisation import Form
 from ponn_torch.solving.continuation import Outcome
+from ponn_torch.solving.guess import project
 from ponn_torch.solving.predictor import along_tangent
 from ponn_torch.solving.sharpening import legible
 from ponn_torch.solving.solution import Solution
 from ponn_torch.solving.stages import Stages
+
+SPARE = 0.25  # of what a coarse stage may miss between its nodes, above which a sharper one would miss too much
 
 
 @dataclass
 class Walk:
     """One start on its way down the schedule: where it stands, and the stages so far that can be trusted.
 
-    norm: ‖r‖ there. equations: what was solved there. n_failed: first stages that failed; until one has not, the walk
-    has not begun. form: of the last stage tried.
+    first: the first curve that was solved; until then the walk has not begun. norm: ‖r‖ where it stands. equations:
+    what was solved there. n_failed: first stages that failed. form: of the last stage tried.
     """
 
     stages: Stages
@@ -32,11 +35,15 @@ class Walk:
     xi: Tensor
     kept: list[Solution] = field(default_factory=list)
     message: str = ""
-    begun: bool = False
+    first: Curve | None = None
     norm: float = math.inf
     equations: Residual | None = None
     n_failed: int = 0
     form: Form | None = None
+
+    @property
+    def begun(self) -> bool:
+        return self.first is not None
 
     def __call__(self, value: float, parameter: str, form: Form | None, *, hold: bool = False) -> Outcome:
         """Solve one stage from where the walk stands; ``hold``: stay there if it cannot be trusted."""
@@ -44,7 +51,9 @@ class Walk:
         if self.begun and (stages.clock.spent or not smoothed):  # nothing to smooth: one stage is all there is
             return Outcome.ABORT
         self.form = form
-        trial = replace(self.collocation, discretisation=stages.discretisation(form))
+        trial = replace(self.collocation, discretisation=stages.discretisation(form, coarse=self.coarse))
+        if trial.n_unknowns != len(self.xi):  # of another form, which goes with all neurons
+            self.collocation, self.xi = self._with_all(Curve(self.collocation, self.xi))
         if smoothed:
             trial = trial.with_setting(**{parameter: value})
         optimizer, xi, equations = stages.optimizer, self.xi, stages.residual(trial)
@@ -62,9 +71,14 @@ class Walk:
         solution = stages.record("smooth", Curve(trial, result.xi), result)
         # measurements need not fit: what counts are the equations
         norm = float(result.norm if stages.measurements is None else trial.residual(result.xi).norm())
-        if norm < stages.solver.start_limit:
+        solved = norm < stages.solver.start_limit
+        if self._unresolved(solution, result, solved):
+            return self(value, parameter, form, hold=hold)
+        if solved:
             return self._advanced(solution, equations, float(result.norm), hold)
-        return Outcome.FAILED if self.begun else self._not_begun(solution, result, norm, parameter)
+        if self.begun:  # what a coarse stage settles above, a sharper one does too
+            return Outcome.ABORT if self.coarse and result.status.stationary else Outcome.FAILED
+        return self._not_begun(solution, result, norm, parameter)
 
     def _predicted(self, trial: Collocation, equations: Residual, parameter: str, value: float) -> Tensor:
         """Where the stage begins: along the tangent from where the walk stands."""
@@ -77,6 +91,36 @@ class Walk:
             return known[at] if at in known else self.stages.residual(trial.with_setting(**{parameter: at}))
 
         return along_tangent(residual, self.xi, self.norm, here, value, self.stages.solver.warm_damping)
+
+    # -- its ansatz ----------------------------------------------------------------------------------------------------
+
+    @property
+    def coarse(self) -> bool:
+        """Whether it might go with more neurons and nodes."""
+        here = self.collocation.discretisation
+        return here is not self.stages.discretisation(here.form)
+
+    def finer(self) -> Walk | None:
+        """A coarse walk once more, with all neurons and nodes from its first stage."""
+        return None if self.first is None or not self.coarse else Walk(self.stages, *self._with_all(self.first))
+
+    def _with_all(self, curve: Curve) -> tuple[Collocation, Tensor]:
+        finer = self.stages.discretisation(curve.collocation.discretisation.form)
+        collocation = replace(curve.collocation, discretisation=finer)
+        return collocation, project(collocation, curve)
+
+    def _unresolved(self, solution: Solution, result: OptimizeResult, solved: bool) -> bool:
+        """Whether a coarse first stage settled above what is solved, or is it, but not between its nodes.
+
+        The walk stands there with all neurons and nodes then.
+        """
+        lacking = not self.stages.trusted(solution) if solved else result.status.stationary
+        if self.begun or not self.coarse or not lacking:
+            return False
+        self.collocation, self.xi = self._with_all(solution.curve)
+        return True
+
+    # -- where it ends -------------------------------------------------------------------------------------------------
 
     def arrive(self) -> None:
         """End at the problem as stated: a last stage where the schedule ended at another value of a parameter.
@@ -97,7 +141,7 @@ class Walk:
 
     def _advanced(self, solution: Solution, equations: Residual, norm: float, hold: bool) -> Outcome:
         """A stage that is solved: the walk goes there, and keeps it if it can be trusted."""
-        stages, self.begun = self.stages, True
+        stages, self.first = self.stages, self.first or solution.curve
         trusted = stages.trusted(solution)
         if hold and not trusted:
             return Outcome.UNTRUSTED
@@ -111,7 +155,11 @@ class Walk:
         if change < 1e-6 * float(xi.abs().max()):
             return Outcome.UNCHANGED
         if trusted and stages.reads_arcs and (blunter := stages.blunter(self.kept)):
-            return Outcome.LEGIBLE if legible(solution.curve, blunter) else Outcome.SOLVED
+            if legible(solution.curve, blunter):
+                return Outcome.LEGIBLE
+            if self.coarse and not stages.trusted(solution, SPARE):
+                return Outcome.SHARPEST
+            return Outcome.SOLVED
         return Outcome.SOLVED if trusted else Outcome.UNTRUSTED
 
     def _not_begun(self, solution: Solution, result: OptimizeResult, norm: float, parameter: str) -> Outcome:
