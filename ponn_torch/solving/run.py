@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Iterator
 
 import torch
 from torch import Tensor
@@ -40,24 +41,20 @@ class Run:
         self.stages, self.solver, self.clock = stages, stages.solver, stages.clock
         self.refused: list[Tensor] = []  # where smoothed solutions began whose refinement failed
         self.causes: list[str] = []  # why starts failed, in short
+        self.guesses: dict[int, tuple[Collocation, Tensor]] = {}  # of starts
+        self.n_begun = 0  # starts that differ from those before
 
     # -- the line ------------------------------------------------------------------------------------------------------
 
     def result(self) -> SolveResult:
         best: tuple[Solution, Certificate] | None = None
-        begun: list[Tensor] = []
         message, verdict, interrupted, n_certified = "", "", False, 0
         try:
             for start in range(self.solver.n_starts):
                 if self.causes.count(SAME) >= MOST_REPEATS:
                     break
                 with self.clock:
-                    first_stage, xi = self._guessed(start)
-                    if any(torch.equal(xi, other) for other in begun):
-                        continue
-                    begun.append(xi)
-                    self.stages.start = start
-                    candidate, note = self._one_start(first_stage, xi)
+                    candidate, note = self._one_start(start)
                 message = note or message
                 if candidate is None:
                     if self.clock.spent:
@@ -78,7 +75,7 @@ class Run:
             message = verdict if n_certified == 1 else f"{verdict}; the cheapest of {n_certified} certified starts"
         spent = self.clock.spent and n_certified < self.solver.n_certified
         if not n_certified and not interrupted:
-            message = self._of_all(message, len(begun))
+            message = self._of_all(message, self.n_begun)
         solution = best[0] if best else self.stages.best()
         if solution is not None:
             self.stages.observer.solution(solution)
@@ -89,7 +86,7 @@ class Run:
         certificate = best[1] if best else None
         seconds = self.clock.seconds
         return SolveResult(
-            solution, certificate, self.stages.done, max(1, len(begun)), message, seconds, interrupted, spent
+            solution, certificate, self.stages.done, max(1, self.n_begun), message, seconds, interrupted, spent
         )
 
     def _of_all(self, message: str, n_starts: int) -> str:
@@ -106,45 +103,59 @@ class Run:
         text = "; ".join(part for part in said if part)
         return text if not self.clock.spent or Status.BUDGET.value in text else f"{Status.BUDGET.value}: {text}"
 
-    def _guessed(self, start: int) -> tuple[Collocation, Tensor]:
-        """The collocation of the first stage, and a start's guess projected on it."""
-        bvp, stream = self.stages.bvp, STREAMS * self.stages.seed + start
-        share = torch.linspace(0.0, 1.0, self.solver.n_segments_of(start) + 1, dtype=torch.float64).to(bvp.unit)
-        collocation = Collocation.on_segments(self.stages.discretisation(None, coarse=True), share * bvp.final_time)
-        if bvp.law.jumps:
-            collocation = collocation.with_setting(smoothing=1.0)
-        return collocation, project(collocation, self.solver.guess.curve(bvp, stream))
-
-    def _one_start(self, collocation: Collocation, xi: Tensor) -> tuple[Solution | None, str]:
+    def _one_start(self, start: int) -> tuple[Solution | None, str]:
         """Everything between a first guess and a trajectory to be judged; None and why where that fails."""
+        self.stages.start = start
         restarted, note = self._restarted()
         if restarted is not None or (note and self.clock.spent):
             return restarted, note
-        walk, led = Walk(self.stages, collocation, xi), list[Tensor]()
-        found, cause = None, NOT_THROUGH
-        while True:
+        found, cause = None, ""
+        for walk in self._walks(start):
             self.solver.continuation.run(walk)
             walk.arrive()
-            if walk.kept:
-                start = walk.kept[-1].curve.knots[0]
-                if any(_same(start, other) for other in led):  # finer, it is what it was
-                    break
-                if any(_same(start, other) for other in self.refused):
-                    cause = SAME
-                    break
-                led.append(start)
-                found, note = self._refined(walk)
-                cause = note
+            if not walk.kept:
+                cause, note = NOT_THROUGH, walk.message
             else:
-                note = note or walk.message
-            finer = walk.finer()
-            if not note or finer is None or self.clock.spent:
+                begins = walk.kept[-1].curve.knots[0]
+                if any(
+                    float((begins - other).abs().max()) < 1e-5 * float(begins.abs().max()) for other in self.refused
+                ):
+                    self.causes.append(SAME)
+                    return None, ""
+                found, note = self._refined(walk)
+                if not note:
+                    return found, ""
+                cause = note
+                if not walk.coarse:
+                    self.refused.append(begins)
+            if self.clock.spent:
                 break
-            walk = finer
         if cause:
-            self.refused += led
             self.causes.append(cause)
         return found, note
+
+    def _walks(self, start: int) -> Iterator[Walk]:
+        """How a start is tried: the first one with few neurons and nodes before all; none if it is one from before."""
+        coarse = start == 0 and self.solver.coarsens(self.solver.form)
+        if coarse:
+            self.n_begun += 1
+            yield Walk(self.stages, *self._guessed(start, coarse=True))
+        for one in range(start + 1):
+            if one not in self.guesses:
+                self.guesses[one] = self._guessed(one)
+        collocation, xi = self.guesses[start]
+        if not any(torch.equal(xi, self.guesses[one][1]) for one in range(start)):
+            self.n_begun += not coarse
+            yield Walk(self.stages, collocation, xi)
+
+    def _guessed(self, start: int, *, coarse: bool = False) -> tuple[Collocation, Tensor]:
+        """The collocation of the first stage, and a start's guess projected on it."""
+        bvp, stream = self.stages.bvp, STREAMS * self.stages.seed + start
+        share = torch.linspace(0.0, 1.0, self.solver.n_segments_of(start) + 1, dtype=torch.float64).to(bvp.unit)
+        collocation = Collocation.on_segments(self.stages.discretisation(None, coarse=coarse), share * bvp.final_time)
+        if bvp.law.jumps:
+            collocation = collocation.with_setting(smoothing=1.0)
+        return collocation, project(collocation, self.solver.guess.curve(bvp, stream))
 
     def _judged(self, candidate: Solution, *, solved: bool) -> tuple[Solution, Certificate]:
         """A candidate with its certificate; what is solved, but not exact enough, is solved once more, finer."""
@@ -162,7 +173,7 @@ class Run:
     def _restarted(self) -> tuple[Solution | None, str]:
         """The arcs of a solution that the first start begins with, refined; None where there are none, or it fails."""
         guess, refinement = self.solver.guess, self.solver.refinement
-        if self.stages.start or not isinstance(guess, Restart) or refinement is None or not refinement.reads_arcs:
+        if self.stages.done or not isinstance(guess, Restart) or refinement is None or not refinement.reads_arcs:
             return None, ""
         curve = guess.on_its_arcs(self.stages.bvp)
         if curve is None:
@@ -187,7 +198,7 @@ class Run:
         """The refined solution where the refinement succeeds or improves, else the smoothed one and why.
 
         It starts from the sharpest stage, and if that fails from the sharpest that had met its tolerance: a stage that
-        had not may show other arcs. A coarse one seldom does, and is made finer instead.
+        had not may show other arcs. With few neurons and nodes it seldom has, and there will be a walk with all.
         """
         refinement, stages = self.solver.refinement, walk.kept
         if refinement is None:
@@ -217,11 +228,6 @@ class Run:
         if refined.outcome is refinements.Outcome.SOLVED or (improved and not refinement.exact):
             return solution, ""
         return smoothed, f"{name}: {refined.message}"
-
-
-def _same(start: Tensor, other: Tensor) -> bool:
-    """Whether two smoothed solutions are one, by w (2n,) where they begin."""
-    return float((start - other).abs().max()) < 1e-5 * float(start.abs().max())
 
 
 def _better(one: Certificate, other: Certificate) -> bool:

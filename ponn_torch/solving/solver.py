@@ -54,8 +54,8 @@ class Solver:
     Attributes:
         basis: free function of the smoothed stages: a basis (its size is the number of neurons per chain) or a network.
         node_kind, n_nodes: collocation points per segment. form: strong or weak residual.
-        coarse: share of the neurons and nodes that a start goes with where it only leads to a refinement; with all of
-            them where its first stage needs them, or the refinement fails. For polynomials and strong residuals.
+        coarse: share of the neurons and nodes that the first start is tried with before all, where it only leads to a
+            refinement. For polynomials and strong residuals.
         n_segments: fixed segments of the smoothed stages, or of each start's in turn: where one polynomial does not
             follow the solution, pieces may.
         optimizer, continuation, guess: of the smoothed stages. refinement: None to stop at the smoothed solution.
@@ -162,7 +162,7 @@ class Solver:
         return {name: fingerprint(value) for name, value in values.items()}
 
     def coarsens(self, form: Form) -> bool:
-        """Whether starts go with fewer neurons and nodes first."""
+        """Whether the first start is tried with few neurons and nodes."""
         leads_on = self.refinement is not None and self.refinement.reads_arcs
         return leads_on and isinstance(form, Strong) and self.basis.coarser(self.coarse) is not self.basis
 

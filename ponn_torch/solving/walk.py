@@ -13,7 +13,6 @@ from ponn_torch.optimal_control.collocation import Collocation
 from ponn_torch.optimal_control.curve import Curve
 from ponn_torch.optimal_control.discretisation import Form
 from ponn_torch.solving.continuation import Outcome
-from ponn_torch.solving.guess import project
 from ponn_torch.solving.predictor import along_tangent
 from ponn_torch.solving.sharpening import legible
 from ponn_torch.solving.solution import Solution
@@ -26,8 +25,8 @@ SPARE = 0.25  # of what a coarse stage may miss between its nodes, above which a
 class Walk:
     """One start on its way down the schedule: where it stands, and the stages so far that can be trusted.
 
-    first: the first curve that was solved; until then the walk has not begun. norm: ‖r‖ where it stands. equations:
-    what was solved there. n_failed: first stages that failed. form: of the last stage tried.
+    norm: ‖r‖ where it stands. equations: what was solved there. n_failed: first stages that failed; until one has not,
+    the walk has not begun. form: of the last stage tried.
     """
 
     stages: Stages
@@ -35,15 +34,11 @@ class Walk:
     xi: Tensor
     kept: list[Solution] = field(default_factory=list)
     message: str = ""
-    first: Curve | None = None
+    begun: bool = False
     norm: float = math.inf
     equations: Residual | None = None
     n_failed: int = 0
     form: Form | None = None
-
-    @property
-    def begun(self) -> bool:
-        return self.first is not None
 
     def __call__(self, value: float, parameter: str, form: Form | None, *, hold: bool = False) -> Outcome:
         """Solve one stage from where the walk stands; ``hold``: stay there if it cannot be trusted."""
@@ -51,9 +46,9 @@ class Walk:
         if self.begun and (stages.clock.spent or not smoothed):  # nothing to smooth: one stage is all there is
             return Outcome.ABORT
         self.form = form
+        if self.coarse and not stages.solver.coarsens(form or stages.solver.form):
+            return Outcome.ABORT
         trial = replace(self.collocation, discretisation=stages.discretisation(form, coarse=self.coarse))
-        if trial.n_unknowns != len(self.xi):  # of another form, which goes with all neurons
-            self.collocation, self.xi = self._with_all(Curve(self.collocation, self.xi))
         if smoothed:
             trial = trial.with_setting(**{parameter: value})
         optimizer, xi, equations = stages.optimizer, self.xi, stages.residual(trial)
@@ -71,10 +66,7 @@ class Walk:
         solution = stages.record("smooth", Curve(trial, result.xi), result)
         # measurements need not fit: what counts are the equations
         norm = float(result.norm if stages.measurements is None else trial.residual(result.xi).norm())
-        solved = norm < stages.solver.start_limit
-        if self._unresolved(solution, result, solved):
-            return self(value, parameter, form, hold=hold)
-        if solved:
+        if norm < stages.solver.start_limit:
             return self._advanced(solution, equations, float(result.norm), hold)
         if self.begun:  # what a coarse stage settles above, a sharper one does too
             return Outcome.ABORT if self.coarse and result.status.stationary else Outcome.FAILED
@@ -92,35 +84,11 @@ class Walk:
 
         return along_tangent(residual, self.xi, self.norm, here, value, self.stages.solver.warm_damping)
 
-    # -- its ansatz ----------------------------------------------------------------------------------------------------
-
     @property
     def coarse(self) -> bool:
-        """Whether it might go with more neurons and nodes."""
+        """Whether it goes with few neurons and nodes, and may end where these do not do."""
         here = self.collocation.discretisation
         return here is not self.stages.discretisation(here.form)
-
-    def finer(self) -> Walk | None:
-        """A coarse walk once more, with all neurons and nodes from its first stage."""
-        return None if self.first is None or not self.coarse else Walk(self.stages, *self._with_all(self.first))
-
-    def _with_all(self, curve: Curve) -> tuple[Collocation, Tensor]:
-        finer = self.stages.discretisation(curve.collocation.discretisation.form)
-        collocation = replace(curve.collocation, discretisation=finer)
-        return collocation, project(collocation, curve)
-
-    def _unresolved(self, solution: Solution, result: OptimizeResult, solved: bool) -> bool:
-        """Whether a coarse first stage settled above what is solved, or is it, but not between its nodes.
-
-        The walk stands there with all neurons and nodes then.
-        """
-        lacking = not self.stages.trusted(solution) if solved else result.status.stationary
-        if self.begun or not self.coarse or not lacking:
-            return False
-        self.collocation, self.xi = self._with_all(solution.curve)
-        return True
-
-    # -- where it ends -------------------------------------------------------------------------------------------------
 
     def arrive(self) -> None:
         """End at the problem as stated: a last stage where the schedule ended at another value of a parameter.
@@ -141,7 +109,7 @@ class Walk:
 
     def _advanced(self, solution: Solution, equations: Residual, norm: float, hold: bool) -> Outcome:
         """A stage that is solved: the walk goes there, and keeps it if it can be trusted."""
-        stages, self.first = self.stages, self.first or solution.curve
+        stages, self.begun = self.stages, True
         trusted = stages.trusted(solution)
         if hold and not trusted:
             return Outcome.UNTRUSTED
