@@ -42,7 +42,7 @@ class Run:
         self.refused: list[Tensor] = []  # where smoothed solutions began whose refinement failed
         self.causes: list[str] = []  # why starts failed, in short
         self.guesses: dict[int, tuple[Collocation, Tensor]] = {}  # of starts
-        self.n_begun = 0  # starts that differ from those before
+        self.tried: set[int] = set()  # starts, without those that are one from before
 
     # -- the line ------------------------------------------------------------------------------------------------------
 
@@ -75,7 +75,7 @@ class Run:
             message = verdict if n_certified == 1 else f"{verdict}; the cheapest of {n_certified} certified starts"
         spent = self.clock.spent and n_certified < self.solver.n_certified
         if not n_certified and not interrupted:
-            message = self._of_all(message, self.n_begun)
+            message = self._of_all(message)
         solution = best[0] if best else self.stages.best()
         if solution is not None:
             self.stages.observer.solution(solution)
@@ -85,16 +85,15 @@ class Run:
             self.stages.observer.failed(message)
         certificate = best[1] if best else None
         seconds = self.clock.seconds
-        return SolveResult(
-            solution, certificate, self.stages.done, max(1, self.n_begun), message, seconds, interrupted, spent
-        )
+        n_starts = max(1, len(self.tried))
+        return SolveResult(solution, certificate, self.stages.done, n_starts, message, seconds, interrupted, spent)
 
-    def _of_all(self, message: str, n_starts: int) -> str:
+    def _of_all(self, message: str) -> str:
         """The message of a failure, with what there is to say of all starts."""
         said = [message]
         if len(self.causes) > 1:
             tally = ", ".join(f"{count} × {cause}" for cause, count in Counter(self.causes).most_common())
-            said.append(f"of {n_starts} starts: {tally}")
+            said.append(f"of {len(self.tried)} starts: {tally}")
         if self.stages.done and all(stage.status is Status.NON_FINITE for stage in self.stages.done):
             said.append(OVERFLOW)
         elif len(self.causes) >= MOST_REPEATS and set(self.causes) == {NOT_THROUGH}:
@@ -108,44 +107,44 @@ class Run:
         self.stages.start = start
         restarted, note = self._restarted()
         if restarted is not None or (note and self.clock.spent):
+            self.tried.add(start)
             return restarted, note
         found, cause = None, ""
         for walk in self._walks(start):
+            self.tried.add(start)
             self.solver.continuation.run(walk)
             walk.arrive()
             if not walk.kept:
                 cause, note = NOT_THROUGH, walk.message
+            elif self._led_here_before(walk):
+                self.causes.append(SAME)
+                return None, ""
             else:
-                begins = walk.kept[-1].curve.knots[0]
-                if any(
-                    float((begins - other).abs().max()) < 1e-5 * float(begins.abs().max()) for other in self.refused
-                ):
-                    self.causes.append(SAME)
-                    return None, ""
                 found, note = self._refined(walk)
                 if not note:
                     return found, ""
                 cause = note
                 if not walk.coarse:
-                    self.refused.append(begins)
+                    self.refused.append(_beginning(walk))
             if self.clock.spent:
                 break
         if cause:
             self.causes.append(cause)
         return found, note
 
+    def _led_here_before(self, walk: Walk) -> bool:
+        here = _beginning(walk)
+        return any(float((here - other).abs().max()) < 1e-5 * float(here.abs().max()) for other in self.refused)
+
     def _walks(self, start: int) -> Iterator[Walk]:
         """How a start is tried: the first one with few neurons and nodes before all; none if it is one from before."""
-        coarse = start == 0 and self.solver.coarsens(self.solver.form)
-        if coarse:
-            self.n_begun += 1
+        if start == 0 and self.solver.coarsens(self.solver.form):
             yield Walk(self.stages, *self._guessed(start, coarse=True))
-        for one in range(start + 1):
+        for one in range(start + 1):  # where few were enough, all are asked for now
             if one not in self.guesses:
                 self.guesses[one] = self._guessed(one)
         collocation, xi = self.guesses[start]
         if not any(torch.equal(xi, self.guesses[one][1]) for one in range(start)):
-            self.n_begun += not coarse
             yield Walk(self.stages, collocation, xi)
 
     def _guessed(self, start: int, *, coarse: bool = False) -> tuple[Collocation, Tensor]:
@@ -228,6 +227,11 @@ class Run:
         if refined.outcome is refinements.Outcome.SOLVED or (improved and not refinement.exact):
             return solution, ""
         return smoothed, f"{name}: {refined.message}"
+
+
+def _beginning(walk: Walk) -> Tensor:
+    """w (2n,) where the sharpest stage begins."""
+    return walk.kept[-1].curve.knots[0]
 
 
 def _better(one: Certificate, other: Certificate) -> bool:
