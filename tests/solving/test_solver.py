@@ -392,7 +392,9 @@ def test_an_infeasible_transfer_is_recognised_early_with_a_message():
     assert result.n_starts == 2
     assert result.message.startswith("start 2 of seed 3 failed: ‖r‖ = 0.")
     assert "after the second stage" in result.message
-    assert [(stage.start, stage.smoothing) for stage in result.stages] == [(0, 1.0), (0, 0.3), (1, 1.0), (1, 0.3)]
+    tried = [0, 0, 1]  # the first one with few neurons, then with all
+    walked = [(start, smoothing) for start in tried for smoothing in (1.0, 0.3)]
+    assert [(stage.start, stage.smoothing) for stage in result.stages] == walked
     assert all(stage.n_iterations <= 60 and stage.norm > 0.1 for stage in result.stages)
     assert result.solution is not None  # what there is can be looked at
 
@@ -617,7 +619,7 @@ def test_a_residual_that_is_not_finite_between_the_nodes_fails_the_refinement(re
     assert result.solution is not None
 
 
-@pytest.mark.parametrize(("reads", "stages"), [(1, 1), (80, 3)])
+@pytest.mark.parametrize(("reads", "stages"), [(1, 1), (80, 4)])
 def test_a_budget_ends_a_solve_that_keeps_what_it_had(monkeypatch, reads, stages):
     """By a clock that counts how often it is read, so that every machine spends it at the same place."""
     ticks = itertools.count()
@@ -717,7 +719,7 @@ OPTIMIZER = Solver().optimizer
 )
 def test_stages_that_lead_to_a_split_end_early_and_others_do_not(optimizer):
     fuel = problem("mars_landing")
-    split = Solver(continuation=Single(1.0), optimizer=optimizer).solve(fuel, 0)
+    split = Solver(continuation=Single(1.0), optimizer=optimizer, coarse=1.0).solve(fuel, 0)
     alone = Solver(continuation=Single(1.0), optimizer=optimizer, refinement=None).solve(fuel, 0)
     assert split.certified
     assert 1e-6 < split.stages[0].norm < 1e-4
@@ -777,9 +779,8 @@ def test_where_no_start_comes_through_it_is_said_what_may_help():
 
 
 def test_starts_take_their_number_of_segments_in_turn():
-    result = Solver(n_segments=(1, 3), n_starts=2, start_limit=1e-300, continuation=Single()).solve(
-        problem("earth_mars")
-    )
+    solver = Solver(n_segments=(1, 3), n_starts=2, start_limit=1e-300, continuation=Single(), coarse=1.0)
+    result = solver.solve(problem("earth_mars"))
     assert [stage.solution.curve.collocation.n_segments for stage in result.stages] == [1, 3]
     assert "of 2 starts: 2 × not through the first stages" in result.message
     with pytest.raises(ValueError, match="n_segments = \\(1, 0\\); allowed: at least 1, or a list of such numbers"):
