@@ -80,7 +80,7 @@ class Solver:
     n_nodes: int = 60
     form: Form = field(default_factory=Strong)
     conditioning: str = "columns"
-    coarse: float = 0.55
+    coarse: float = 0.6
     n_segments: int | Sequence[int] = (1, 1, 4, 1, 1, 4, 4, 4, 4)
     optimizer: Optimizer = field(default_factory=_default_optimizer)
     continuation: Schedule = field(default_factory=lambda: Ladder((1.0, 0.3, 0.1, 0.03)))

@@ -144,4 +144,5 @@ class Walk:
         self.n_failed += 1
         # smoothed less, the problem may have a solution, or one that is nearer to this guess
         again = self.n_failed == 1 and stages.bvp.law.jumps and parameter == "smoothing" and not stages.clock.spent
+        again = again and not self.coarse  # with all neurons and nodes, it may have one at once
         return Outcome.FAILED if again else Outcome.ABORT
