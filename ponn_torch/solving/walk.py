@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 
 from torch import Tensor
 
-from ponn_torch.optim.base import NonFiniteResidual, OptimizeResult, Residual, warm
+from ponn_torch.optim.base import NonFiniteResidual, OptimizeResult, Residual, loosened, warm
 from ponn_torch.optim.remembering import Remembering
 from ponn_torch.optimal_control.collocation import Collocation
 from ponn_torch.optimal_control.curve import Curve
@@ -18,6 +18,7 @@ from ponn_torch.solving.sharpening import legible
 from ponn_torch.solving.solution import Solution
 from ponn_torch.solving.stages import Stages
 
+ENOUGH = 5e-3  # ‖r‖ at which a coarse stage ends
 SPARE = 0.25  # of what a coarse stage may miss between its nodes, above which a sharper one would miss too much
 
 
@@ -54,6 +55,8 @@ class Walk:
         optimizer, xi, equations = stages.optimizer, self.xi, stages.residual(trial)
         if stages.solver.predictor != "none" and len(trial.linear_unknowns) == trial.n_unknowns:
             equations = Remembering(equations)  # of a network that is trained no tangent is known: J leaves many
+        if self.coarse:
+            optimizer = loosened(optimizer, ENOUGH)
         if self.begun:
             optimizer = warm(optimizer, stages.solver.warm_damping)
             if isinstance(equations, Remembering):
