@@ -97,6 +97,10 @@ class Refinement(Protocol):
         """
         ...
 
+    def brief(self) -> Self:
+        """The same without what takes long, for a first try after which there is another one."""
+        return self
+
     def finer(self) -> Self | None:
         """The same at a higher resolution, for what is solved but not exactly enough; None if there is none."""
         return None

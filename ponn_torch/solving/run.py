@@ -202,7 +202,8 @@ class Run:
         refinement, stages = self.solver.refinement, walk.kept
         if refinement is None:
             return stages[-1], ""
-        refined, note = self._refine(refinement, stages[-1], self.stages.blunter(stages))
+        blunter = self.stages.blunter(stages)
+        refined, note = self._refine(refinement.brief() if walk.coarse else refinement, stages[-1], blunter)
         if not note or not refinement.reads_arcs or walk.coarse or self.clock.spent:
             return refined, note
         solved = [i for i, stage in enumerate(stages) if stage.curve.residual_norm < self.solver.stage_tolerance]

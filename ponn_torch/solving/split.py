@@ -12,7 +12,8 @@ from __future__ import annotations
 import math
 from collections import defaultdict
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from typing import Self
 
 import torch
 from torch import Tensor
@@ -102,6 +103,10 @@ class Split(Segmentation, Refinement):
     sign_tolerance: float = 1e-10
     max_sharpenings: int = 10
     sharpening: float = 0.5
+
+    def brief(self) -> Self:
+        """From the curve that is given alone: sharper ones are found on segments, at many times the cost."""
+        return replace(self, max_sharpenings=0)
 
     def run(self, start: Curve, callback: MakeCallback | None = None, blunter: Curve | None = None) -> Refined:
         search = _Search(self, start.collocation.bvp, Rounds(start, callback))
