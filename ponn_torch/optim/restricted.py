@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, cast
 
 from torch import Tensor
 
@@ -19,6 +19,24 @@ class Layered(Residual, Protocol):
     def linear_unknowns(self) -> Tensor:
         """Ascending positions in ξ of all unknowns but hidden weights."""
         ...
+
+
+class Wrapping:
+    """What a residual around another one, ``inner``, passes on where the unknowns and the equations are the same."""
+
+    inner: Residual
+
+    @property
+    def n_unknowns(self) -> int:
+        return self.inner.n_unknowns
+
+    @property
+    def linear_unknowns(self) -> Tensor:
+        """Those of a residual that knows its output layer."""
+        return cast(Layered, self.inner).linear_unknowns
+
+    def blocks(self, residual: Tensor) -> Mapping[str, Tensor]:
+        return self.inner.blocks(residual)
 
 
 @dataclass(frozen=True, eq=False)

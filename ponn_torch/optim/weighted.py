@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import cast
 
 import torch
 from torch import Tensor
@@ -18,7 +17,7 @@ from ponn_torch.numerics.linalg import Jacobian
 from ponn_torch.optim.base import Around, Callback, Optimizer, OptimizeResult, Residual
 from ponn_torch.optim.checkpoint import Checkpoint
 from ponn_torch.optim.driver import Counted
-from ponn_torch.optim.restricted import Layered
+from ponn_torch.optim.restricted import Wrapping
 
 LARGEST = 1e3  # of an adaptive weight, and its inverse the smallest
 
@@ -47,7 +46,7 @@ def check_equations(weights: Mapping[str, float], equations: Iterable[str]) -> N
 
 
 @dataclass(frozen=True, eq=False)
-class Weighted:
+class Weighted(Wrapping):
     """W r with one weight per equation, 1 where none is given; ``blocks`` are those of W r.
 
     Raises:
@@ -59,15 +58,6 @@ class Weighted:
 
     def __post_init__(self) -> None:
         _check_positive(self.weights)
-
-    @property
-    def n_unknowns(self) -> int:
-        return self.inner.n_unknowns
-
-    @property
-    def linear_unknowns(self) -> Tensor:
-        """Those of a residual that knows its output layer."""
-        return cast(Layered, self.inner).linear_unknowns
 
     @cached_property
     def _rows(self) -> dict[int, Tensor]:
@@ -94,9 +84,6 @@ class Weighted:
         r, jacobian = self.inner.linearise(xi)
         factors = self._factors(r)
         return factors * r, jacobian.scaled_rows(factors)
-
-    def blocks(self, residual: Tensor) -> Mapping[str, Tensor]:
-        return self.inner.blocks(residual)
 
 
 @dataclass(frozen=True)
