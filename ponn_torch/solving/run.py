@@ -172,7 +172,7 @@ class Run:
     def _restarted(self) -> tuple[Solution | None, str]:
         """The arcs of a solution that the first start begins with, refined; None where there are none, or it fails."""
         guess, refinement = self.solver.guess, self.solver.refinement
-        if self.stages.done or not isinstance(guess, Restart) or refinement is None or not refinement.reads_arcs:
+        if self.stages.start or not isinstance(guess, Restart) or refinement is None or not refinement.reads_arcs:
             return None, ""
         curve = guess.on_its_arcs(self.stages.bvp)
         if curve is None:
